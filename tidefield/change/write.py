@@ -105,7 +105,7 @@ def polygons_of(
 
 def outline_rows(change: Change) -> list[dict[str, Any]]:
     """One row for each outline, the largest volume first."""
-    signs, (east, north) = change.outlines.signs, _middles(change)
+    signs = change.outlines.signs
     values = [
         (
             number,
@@ -115,8 +115,7 @@ def outline_rows(change: Change) -> list[dict[str, Any]]:
             *volume.interval_m3,
             float(signs[number - 1]) * volume.value_m3 / volume.area_m2,
             float(signs[number - 1]) * largest,
-            float(east[number - 1]),
-            float(north[number - 1]),
+            *_middle(change, number),
         )
         for number, volume, largest in change.each
     ]
@@ -124,18 +123,12 @@ def outline_rows(change: Change) -> list[dict[str, Any]]:
     return sorted(rows, key=lambda row: -row["volume_m3"])
 
 
-def _middles(change: Change) -> tuple[np.ndarray, np.ndarray]:
-    """East and north of the mean of each outline's cells, in the comparison's coordinates."""
-    labels, count = change.outlines.labels, len(change.outlines.signs)
-    sums = np.zeros((3, count + 1))
-    for rows in change.grid.strips():
-        row, column = np.nonzero(labels[rows])
-        number = labels[rows][row, column]
-        for own, weight in zip(sums, (None, column + 0.5, row + rows.start + 0.5), strict=True):
-            own += np.bincount(number, weight, count + 1)
-    cells, columns, downwards = sums[:, 1:]
-    grid = change.grid
-    return grid.west_m + grid.cell_m * columns / cells, grid.north_m - grid.cell_m * downwards / cells
+def _middle(change: Change, number: int) -> tuple[float, float]:
+    """East and north of the mean of an outline's cells, in the comparison's coordinates."""
+    box = change.outlines.boxes[number - 1]
+    row, column = np.nonzero(change.outlines.labels[box] == number)
+    part = change.grid.part(box)
+    return part.west_m + part.cell_m * float(column.mean() + 0.5), part.north_m - part.cell_m * float(row.mean() + 0.5)
 
 
 def volume_rows(change: Change) -> list[dict[str, Any]]:

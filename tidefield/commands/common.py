@@ -106,7 +106,9 @@ class ZeroShot:
         """Raises: RunError, before photographs are read, which may take minutes, when there are no such weights."""
         from tidefield.train.checkpoint import given_or_shipped, read_weights_file
 
-        read_weights_file(given_or_shipped(self.weights, self.network))
+        weights = given_or_shipped(self.weights, self.network)
+        if self.weights is not None:
+            read_weights_file(weights)
 
 
 @dataclass(frozen=True)

@@ -310,10 +310,10 @@ def _new_run(options: Train) -> tuple[Run, Path | None]:
             "--weights is given for a training that starts without (--from-scratch, another method, or a variant that "
             "is one): expected one or the other; leave one out"
         )
-    if weights is None and not options.from_scratch and isinstance(config, Config):
-        weights = shipped_weights(config.preset) if config.network == PRESETS[config.preset].network else None
     if weights is not None:
         read_weights_file(weights)  # before photographs are read, which may take minutes
+    elif not options.from_scratch and isinstance(config, Config):
+        weights = shipped_weights(config.preset) if config.network == PRESETS[config.preset].network else None
     digest = None if weights is None else weights_sha256(weights)
     root = Path(os.path.realpath(options.scene))
     if isinstance(config, Config) and config.train.crop_px is None:

@@ -183,9 +183,7 @@ def make_missing(job: Job, out: Path, progress: Callable[[int, int], None], make
         done += 1
         progress(done, len(files))
     # In the joined map they would be holes, like what lies outside of the area.
-    there = {*(out / TILES).glob("*")}
-    # A network folder may list what it had a minute ago: a file that is not listed is asked for.
-    if lost := sum(files[number] not in there and not files[number].exists() for number in missing):
+    if lost := sum(not files[number].exists() for number in missing):
         raise RunError(
             f"{lost} of the {len(missing)} tiles that were made are not in {out / TILES}: expected a folder that all "
             "machines share under this name; choose one, or share it, and repeat the command"

@@ -209,7 +209,7 @@ class Atlas:
         sheets = sorted(map(open_sheet, folders), key=lambda sheet: (sheet.date is None, sheet.date or ""))
         self.sheets = _with_common_ends(_with_own_titles(sheets))
         self._state = _state(self.sheets)
-        self._systems = [_system(sheet) for sheet in self.sheets]
+        self._systems = [_placed(sheet)[1] for sheet in self.sheets]
         stated = ((sheet, crs) for sheet, crs in zip(self.sheets, self._systems, strict=True) if crs is not None)
         self.crs = next((_of_the_ground(sheet, crs) for sheet, crs in stated), None)
         self._require_one_frame()
@@ -365,11 +365,11 @@ class Atlas:
                     own = error[chosen & np.isfinite(error)]
                     sums[name] += np.array([np.abs(above[chosen]).sum(), chosen.sum(), own.sum(), len(own)])
         result: dict[str, Any] = {"cells_m2": cells * cell_area}
-        for name, (height, count, error, known) in sums.items():
+        for name, (height, count, error, with_error) in sums.items():
             value = float(height) * cell_area
             result[name] = {"value_m3": value}
-            if known or (sigma is not None and not count):
-                half = Z95 * float(error / max(known, 1) * count) * cell_area
+            if with_error or (sigma is not None and not count):
+                half = Z95 * float(error / max(with_error, 1) * count) * cell_area
                 result[name] |= {"low_m3": value - half, "high_m3": value + half}
         return result if cells else {}
 
@@ -474,7 +474,7 @@ def _of_the_ground(sheet: Sheet, crs: Any) -> Any:
     own = CRS.from_wkt(crs.to_wkt())
     if is_local(own) or not (own.is_geographic or (own.is_projected and in_metres(own))):
         return crs
-    with _opened(_placed(sheet)) as file:
+    with _opened(_placed(sheet)[0]) as file:
         corner, column, row = file.transform, file.width / 2, file.height / 2
     x = corner.c + corner.a * column + corner.b * row
     y = corner.f + corner.d * column + corner.e * row
@@ -482,18 +482,13 @@ def _of_the_ground(sheet: Sheet, crs: Any) -> Any:
     return crs if same_system(metric, own) else type(crs).from_wkt(metric.to_wkt())
 
 
-def _placed(sheet: Sheet) -> Path | Surface:
-    """The first raster of a sheet that states a coordinate system; the first of all where none does."""
+def _placed(sheet: Sheet) -> tuple[Path | Surface, Any]:
+    """The first raster of a sheet that states a coordinate system, and that; the first of all where none does."""
     for layer in sheet.layers:
         with _opened(layer.source) as file:
             if file.crs is not None:
-                return layer.source
-    return sheet.layers[0].source
-
-
-def _system(sheet: Sheet) -> Any:
-    with _opened(_placed(sheet)) as file:
-        return file.crs
+                return layer.source, file.crs
+    return sheet.layers[0].source, None
 
 
 def _state(sheets: Sequence[Sheet]) -> list[tuple[int, int] | None]:
