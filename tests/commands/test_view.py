@@ -35,6 +35,12 @@ def test_a_scene_without_zero_shot_is_one_clear_error(scene: Path):
     refused("is a scene, not a run: .* add --zero-shot", scene)
 
 
+def test_what_is_neither_run_nor_scene_nor_map_is_one_clear_error(tmp_path: Path):
+    pytest.importorskip("viser")
+    refused("gone does not exist: expected a run, a folder of `tidefield map`", tmp_path / "gone")
+    refused(r" is no run or map: expected a run, a folder of `tidefield map`.* --zero-shot a scene", tmp_path)
+
+
 def test_a_run_that_is_being_trained_and_has_saved_nothing_is_one_clear_error(scene: Path, tmp_path: Path):
     pytest.importorskip("viser")
     with only_writer(tmp_path / "run"):

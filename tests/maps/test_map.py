@@ -30,13 +30,13 @@ AREA = 5.0
 """Half the side of the square that is mapped, metres: a few tiles."""
 
 
-def polygon(folder: Path, half: float = AREA, east: float = 0.0) -> Path:
+def polygon(folder: Path, half: float = AREA, east: float = 0.0, north: float = 0.0) -> Path:
     corners = [
-        [east - half, -half],
-        [east + half, -half],
-        [east + half, half],
-        [east - half, half],
-        [east - half, -half],
+        [east - half, north - half],
+        [east + half, north - half],
+        [east + half, north + half],
+        [east - half, north + half],
+        [east - half, north - half],
     ]
     path = folder / f"area_{half:g}_{east:g}.geojson"
     path.write_text(json.dumps({"type": "Polygon", "coordinates": [corners]}))
@@ -211,6 +211,25 @@ def test_a_finished_or_foreign_folder_is_not_overwritten(scene: Path, out: Path,
     with pytest.raises(RunError, match="holds something else"):
         mapped(scene, tmp_path / "mine")
     assert (out / MAP_FILE).read_bytes() == before
+
+
+def test_a_filled_map_has_no_holes_even_where_no_two_photographs_see_a_tile(
+    scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
+    mapped(scene, tmp_path / "map", area=polygon(tmp_path, 8.0, 32.0, 25.0), gsd=0.25, fill=True)
+    assert [record.getMessage() for record in caplog.records if "its unit counts as a metre" in record.getMessage()]
+    found = {}
+    for name in (DSM, SIGMA, ORTHOPHOTO, VIEWS, CLASSES, make.FILLED):
+        with rasterio.open(tmp_path / "map" / name) as dataset:
+            found[name] = dataset.read(masked=True)[-1]
+    views, filled = found[VIEWS].data, found[make.FILLED].data
+    assert (views[:32, -32:] < 2).all()  # more than a tile's own cells
+    assert ((filled == 1) == (views < 2)).all()
+    assert (found[ORTHOPHOTO].data == 255).all()
+    assert not found[DSM].mask.any()
+    # What no two photographs show is level, and they do not agree there: it is no water for all that.
+    assert not (found[CLASSES] == 9).any()
+    assert np.median(found[SIGMA].data[:32, -32:]) > 0.5
 
 
 @pytest.mark.thorough

@@ -49,8 +49,9 @@ def test_water_and_its_level_are_found():
     assert ((labels > 0) & wet).sum() / ((labels > 0) | wet).sum() > 0.85
     assert abs(body.level - LEVEL) < 0.004
     assert 0 < body.sigma < NOISE
-    # Photographs that agree, or no level surface, are no water.
+    # Photographs that agree, fewer than two, or no level surface, are no water.
     assert not find_water(height, np.full_like(agreement, 0.4), plants, GRID)[1]
+    assert not find_water(height, np.where(wet, np.float32(np.nan), agreement), plants, GRID)[1]
     _, x = np.mgrid[: GRID.rows, : GRID.columns] * GRID.cell
     assert not find_water((height + 0.1 * x).astype(np.float32), agreement, plants, GRID)[1]
 
@@ -155,7 +156,7 @@ def test_classes_polygons_and_waterline_are_written(
     np.testing.assert_array_equal(levelled[~lake], height[~lake])
     assert (errors[~lake & known] == np.float32(0.02)).all()
     assert np.isnan(errors[~known]).all()
-    write_masks(tmp_path / "classes.tif", water, GRID, tmp_path / "masks")
+    write_masks(tmp_path / "classes.tif", tmp_path / "agreement.tif", water, GRID, tmp_path / "masks")
     assert {name for name, _ in pyogrio.list_layers(tmp_path / "masks" / "masks.gpkg")} == {
         "vegetation",
         "water",

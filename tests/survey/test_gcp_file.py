@@ -103,7 +103,9 @@ def test_marks_in_missing_photographs_are_left_out_and_reported(tmp_path):
     found, remarks = control(survey_folder(tmp_path), UTM + "\n" + lines)
     assert list(found.points) == ["A"]
     assert len(found.marks) == 1
-    assert remarks == ["gcp_list.txt marks points in photographs that do not exist (left out): IMG 7.JPG, gone.JPG."]
+    assert remarks == [
+        "gcp_list.txt marks points in photographs that are not among the survey's (left out): IMG 7.JPG, gone.JPG."
+    ]
 
 
 def test_marks_outside_their_photograph_are_left_out_and_reported(tmp_path):

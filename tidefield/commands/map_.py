@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     from tidefield.cluster import Share
     from tidefield.maps.make import Job
     from tidefield.model.rendering import Render
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -88,6 +91,8 @@ def map_(options: Map, console: Console) -> dict[str, Any]:
             highlight=False,
             soft_wrap=True,
         )
+        if frame.frame is None:
+            log.warning("the scene is not georeferenced: its unit counts as a metre in looking for plants and water")
         if options.cluster is None:
             makes = TileMaker(job, render, options.out).several
         else:

@@ -158,11 +158,20 @@ def _open_browser(address: str) -> bool:
 
 
 def _require_trained(folder: Path) -> None:
-    """Raises: RunError when a run is being trained and has saved nothing yet."""
+    """Raises: RunError when a folder is nothing that can be shown, or a run that has saved nothing yet."""
+    from tidefield.data.load import is_scene
     from tidefield.files import is_locked
     from tidefield.train.checkpoint import CHECKPOINT_FILE, RUN_FILE
 
-    if not (os.path.exists(folder / RUN_FILE) and is_locked(folder)):
+    if not os.path.exists(folder / RUN_FILE):
+        if is_scene(folder):
+            return  # `open_source` says what to do
+        found = "is no run or map" if os.path.exists(folder) else "does not exist"
+        raise RunError(
+            f"{folder} {found}: expected a run, a folder of `tidefield map`, ODM or `tidefield change`, or with "
+            "--zero-shot a scene; name one"
+        )
+    if not is_locked(folder):
         return
     if not os.path.exists(folder / CHECKPOINT_FILE):
         raise RunError(

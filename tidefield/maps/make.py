@@ -85,7 +85,7 @@ STRIP_CELLS = 1_000_000
 GDAL_CACHE_BYTES = 128_000_000
 """Memory of GDAL for blocks, beside those of a row of them in each raster, which would be written again and again
 otherwise. By itself it takes a twentieth of the machine's."""
-VERSION = 7
+VERSION = 8
 """Of tiles; to be raised with what they hold."""
 
 
@@ -227,29 +227,28 @@ class TileMaker:
                 self._write(self._tiles[number], matched)
                 yield number
 
-    def _match(self, tile: Tile) -> Matched | None:
+    def _match(self, tile: Tile) -> Matched:
         return match(tile, self._start, self._job.scene, self._grey, self._gsd)
 
-    def _write(self, tile: Tile, matched: Matched | None) -> None:
+    def _write(self, tile: Tile, matched: Matched) -> None:
         job = self._job
         values: dict[str, np.ndarray] = {}
-        if matched is not None:
-            wanted = inside(job.area, tile)
-            seen = (matched.count >= FEWEST_VIEWS) & wanted
-            shown = wanted if job.fill else seen
-            if shown.any():
-                above = matched.height - np.float32(job.grid.height)
-                colour = render_tile(self._render, tile, above, matched.sigma)
-                values = {
-                    "height": matched.height,
-                    "sigma": matched.sigma,
-                    "score": matched.score.astype(np.float16),
-                    "count": np.minimum(matched.count, 65535).astype(np.uint16),
-                    "main": matched.main.astype(np.uint16),
-                    "seen": seen,
-                    "shown": shown,
-                    "colour": colour,
-                }
+        wanted = inside(job.area, tile)
+        seen = (matched.count >= FEWEST_VIEWS) & wanted
+        shown = wanted if job.fill else seen
+        if shown.any():
+            above = matched.height - np.float32(job.grid.height)
+            colour = render_tile(self._render, tile, above, matched.sigma)
+            values = {
+                "height": matched.height,
+                "sigma": matched.sigma,
+                "score": matched.score.astype(np.float16),
+                "count": np.minimum(matched.count, 65535).astype(np.uint16),
+                "main": matched.main.astype(np.uint16),
+                "seen": seen,
+                "shown": shown,
+                "colour": colour,
+            }
         with (
             completed_file(tile_file(self._out, tile), overwrite=True) as partial_file,
             partial_file.open("wb") as file,
@@ -375,7 +374,7 @@ def join(job: Job, out: Path, progress: Callable[[int, int], None]) -> dict[str,
                 "main": strip.main[None],
                 "dsm": np.where(strip.shown, strip.height, NODATA)[None],
                 "sigma": np.where(strip.shown, strip.sigma, NODATA)[None],
-                "agreement": np.where(strip.shown, np.round(100 * np.nan_to_num(strip.score).clip(0, 1)), 255)[None],
+                "agreement": np.where(strip.seen, np.round(100 * np.nan_to_num(strip.score).clip(0, 1)), 255)[None],
                 "filled": np.where(strip.shown, ~strip.seen, 255)[None],
             }
             for name, writer in writers.items():
@@ -413,7 +412,7 @@ def derive(job: Job, out: Path, progress: Callable[[int, int], None]) -> dict[st
         out / CLASSES, ("class",), "uint8", 0.0, tags={"VALUES": "2 ground, 3 vegetation, 9 water"}, average=False
     )
     write_classes(classes, out / DSM, out / ORTHOPHOTO, water, grid)
-    write_masks(out / CLASSES, water, grid, out / MASKS)
+    write_masks(out / CLASSES, out / AGREEMENT, water, grid, out / MASKS)
     if lost := lost_in_geojson(grid.frame):
         log.warning(lost)
     progress(1, 6)

@@ -96,7 +96,7 @@ def find_water(
 
     Args:
         height: of cells, NaN where there are none.
-        agreement: mean correlation of the photographs there.
+        agreement: mean correlation of the photographs there; NaN where fewer than two show a cell, which is no water.
         plants: cells that show plants.
         grid: the cells.
 
@@ -104,7 +104,7 @@ def find_water(
         The number of the body in each cell, from 1, 0 for none; and the bodies.
     """
     cell, up = grid.cell / grid.frame.metre, grid.frame.metre_up
-    known = np.isfinite(height) & ~plants
+    known = np.isfinite(height) & np.isfinite(agreement) & ~plants
     labels, bodies = np.zeros(height.shape, np.int32), []
     if not known.any():
         return labels, bodies
@@ -341,7 +341,7 @@ def _colours(path: Path, around: int) -> Iterator[UInt8[np.ndarray, "3 h w"]]:
         yield np.stack([np.nan_to_num(band[2]).astype(np.uint8) for band in (red, green, blue)])
 
 
-def write_masks(classes: Path, water: Water, grid: Grid, folder: Path) -> None:
+def write_masks(classes: Path, agreement: Path, water: Water, grid: Grid, folder: Path) -> None:
     """Write masks.gpkg with the layers vegetation, water and waterline, and a GeoJSON of each, into a folder.
 
     Plants are outlined in cells that are as much larger as memory asks.
@@ -358,7 +358,7 @@ def write_masks(classes: Path, water: Water, grid: Grid, folder: Path) -> None:
     layers = [
         Layer("vegetation", "Polygon", plants, {"area": [shape.area for shape in plants]}),
         Layer("water", "Polygon", [shape for shape, _ in wet], fields),
-        _waterline(wet, ~np.isfinite(values), reduced),
+        _waterline(wet, ~np.isfinite(read_reduced(agreement, grid)[0]), reduced),
     ]
     write_geopackage(folder / "masks.gpkg", layers, grid.frame.horizontal_wkt)
     for layer in layers:
@@ -379,7 +379,7 @@ def _waterline(wet: Sequence[tuple[BaseGeometry, Body]], unknown: Bool[np.ndarra
     """The shores of water, without those stretches where the map ends.
 
     Args:
-        unknown: cells without a surface.
+        unknown: cells that fewer than two photographs show.
         grid: of these.
     """
     ends = np.pad(unknown, 1, constant_values=True)

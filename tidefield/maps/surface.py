@@ -232,8 +232,10 @@ def choose_views(tile: Tile, scene: Scene, start: Start) -> Choice:
     return Choice(views, indices, chosen, pairs)
 
 
-def match(tile: Tile, start: Start, scene: Scene, grey: GreyPhotographs, gsd: float) -> Matched | None:
+def match(tile: Tile, start: Start, scene: Scene, grey: GreyPhotographs, gsd: float) -> Matched:
     """Measure the heights of a tile's cells, margin included.
+
+    Where fewer than two photographs see any of it, the surface is that of the sparse points.
 
     Args:
         tile: the cells.
@@ -241,18 +243,37 @@ def match(tile: Tile, start: Start, scene: Scene, grey: GreyPhotographs, gsd: fl
         scene: all photographs, at the size to match at.
         grey: the same photographs in grey.
         gsd: the photographs' median ground sampling distance, horizontal units.
-
-    Returns:
-        None where no two photographs see any of the tile.
     """
     choice = choose_views(tile, scene, start)
     views, indices = choice.views, choice.indices
-    if len(views) < 2:
-        return None
-    factor = max(1, round(tile.grid.cell / gsd))
     expected = start.on(tile, PAD) - np.float32(tile.grid.height)
-    above = float(np.median([view.position[2] for view in views]) - np.median(expected))
+    standing = [view.position[2] for view in views] or positions_from(tile, scene.cameras)[:, 2]
+    above = float(np.median(standing) - np.median(expected))
     low, high = float(expected.min()) - BELOW * above, float(expected.max()) + ABOVE * above
+    if len(views) < 2:
+        found = expected, np.full_like(expected, (high - low) / 4), np.zeros_like(expected)
+    else:
+        found = _matched(tile, choice, grey, max(1, round(tile.grid.cell / gsd)), expected, low, high)
+    inner = slice(PAD, PAD + tile.side)
+    height, sigma, score = (values[inner, inner] for values in found)
+    east, north = tile.offsets()
+    count, main = np.zeros(height.shape, np.int64), np.zeros(height.shape, np.int64)
+    best = np.zeros(height.shape, np.float32)
+    for view, index in zip(views, indices, strict=True):
+        u, v, z = view.pixels(east, north, height)
+        sees = view.sees(u, v, z, height, east, north)
+        count += sees
+        rank = np.where(sees, view.rank(u, v, height, east, north), 0)
+        main[rank > best] = index + 1
+        best = np.maximum(rank, best)
+    return Matched((height + np.float32(tile.grid.height)).astype(np.float32), sigma, score, count, main)
+
+
+def _matched(
+    tile: Tile, choice: Choice, grey: GreyPhotographs, factor: int, expected: Height, low: float, high: float
+) -> tuple[Height, Height, Height]:
+    """Heights between two limits, their standard errors and scores, of a tile's cells and `PAD` cells around it."""
+    views, indices = choice.views, choice.indices
     pairs = Pairs(choice.pairs, views, indices, grey, factor, tile.grid.cell, tile.side + 2 * PAD)
     low, high = pairs.narrowed(low, high)
     height = pairs.heights(low, high)
@@ -276,19 +297,7 @@ def match(tile: Tile, start: Start, scene: Scene, grey: GreyPhotographs, gsd: fl
     score = np.nan_to_num(score).astype(np.float32)
     by_gap = (1 - _blur(_determined(matching, step * SWEEPS[-1][0]), BRIDGED_CELLS)) * spread
     sigma = np.hypot(standard_error(height, matching, tile.grid.cell_up), by_gap).astype(np.float32)
-    inner = slice(PAD, PAD + tile.side)
-    height, sigma, score = height[inner, inner], sigma[inner, inner], score[inner, inner]
-    east, north = tile.offsets()
-    count, main = np.zeros(height.shape, np.int64), np.zeros(height.shape, np.int64)
-    best = np.zeros(height.shape, np.float32)
-    for view, index in zip(views, indices, strict=True):
-        u, v, z = view.pixels(east, north, height)
-        sees = view.sees(u, v, z, height, east, north)
-        count += sees
-        rank = np.where(sees, view.rank(u, v, height, east, north), 0)
-        main[rank > best] = index + 1
-        best = np.maximum(rank, best)
-    return Matched((height + np.float32(tile.grid.height)).astype(np.float32), sigma, score, count, main)
+    return height, sigma, score
 
 
 def standard_error(height: Height, matching: Height, cell: float) -> Height:

@@ -121,7 +121,8 @@ def read_control(path: Path, photographs: Sequence[Photograph]) -> tuple[Control
     remarks = unit_remarks(path, system)
     if missing:
         remarks.append(
-            f"{path.name} marks points in photographs that do not exist (left out): {list_names(list(missing))}."
+            f"{path.name} marks points in photographs that are not among the survey's (left out): "
+            f"{list_names(list(missing))}."
         )
     return control, remarks + [f"{path.name}: {reason} and is left out." for reason in outside]
 
@@ -154,7 +155,7 @@ def _parse_line(where: str, line: str) -> tuple[list[float], str]:
 
 
 def split_unknown(rest: str) -> tuple[str, list[str]]:
-    """Split the name, which may have spaces, of a photograph that does not exist from the words behind it."""
+    """Split the name, which may have spaces, of a photograph that the survey lacks from the words behind it."""
     if "\t" in rest:
         return rest.split("\t")[0], rest.split("\t")[1:]
     words = rest.split()
