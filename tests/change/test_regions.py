@@ -10,7 +10,9 @@ from pyproj import CRS
 from surveys_of_two_dates import NORTH, WEST
 
 from tidefield.change.regions import read_regions
-from tidefield.change.surfaces import ChangeError, Grid
+from tidefield.change.surfaces import Grid
+from tidefield.errors import RunError
+from tidefield.maps.grid import LOCAL_WKT
 
 raw = pytest.importorskip("pyogrio").raw
 GRID = Grid(CRS("EPSG:32630").to_wkt(), WEST, NORTH, 0.5, 200, 200)
@@ -40,12 +42,12 @@ def names(path: Path) -> list[str]:
 
 def test_of_several_layers_one_is_named(tmp_path: Path):
     path = write_layers(tmp_path / "a.gpkg", {"notes": None, "creeks": CREEK, "roads": ROAD})
-    with pytest.raises(ChangeError, match="creeks, roads: expected the name of one"):
+    with pytest.raises(RunError, match="creeks, roads: expected the name of one"):
         read_regions(path, GRID)
     assert names(tmp_path / "a.gpkg:roads") == ["roads"]
-    with pytest.raises(ChangeError, match="creeks, roads: expected the name of one"):
+    with pytest.raises(RunError, match="creeks, roads: expected the name of one"):
         read_regions(tmp_path / "a.gpkg:notes", GRID)
-    with pytest.raises(ChangeError, match="is not a file"):
+    with pytest.raises(RunError, match="is not a file"):
         read_regions(tmp_path / "b.gpkg:roads", GRID)
 
 
@@ -58,9 +60,16 @@ def test_polygons_of_an_undefined_system_lie_as_the_surveys_do(tmp_path: Path):
     assert names(path) == ["creeks"]
 
 
+def test_coordinates_of_maps_in_a_local_frame_are_local(tmp_path: Path):
+    square = {"type": "Polygon", "coordinates": [[[0, 0], [5, 0], [5, 5], [0, 5], [0, 0]]]}
+    (tmp_path / "a.geojson").write_text(json.dumps(square))
+    [region] = read_regions(tmp_path / "a.geojson", Grid(LOCAL_WKT, 0.0, 10.0, 1.0, 10, 10))
+    assert region.geometry.bounds == (0, 0, 5, 5)
+
+
 def test_a_table_without_geometries_is_refused(tmp_path: Path):
     (tmp_path / "a.csv").write_text("a,b\n1,2\n")
-    with pytest.raises(ChangeError, match="no geometries"):
+    with pytest.raises(RunError, match="no geometries"):
         read_regions(tmp_path / "a.csv", GRID)
 
 

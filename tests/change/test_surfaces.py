@@ -37,6 +37,15 @@ def test_other_pixels_are_read_at_the_centres_of_the_cells(tmp_path: Path):
     assert np.abs(difference).max() < 1e-4
 
 
+def test_a_file_that_refers_to_others_is_opened_only_if_its_name_says_so(tmp_path: Path):
+    write_surface(tmp_path / "a.tif", plane(80, 100, 0.5))
+    pytest.importorskip("rasterio.shutil").copy(tmp_path / "a.tif", tmp_path / "b.vrt", driver="VRT")
+    assert open_surface(tmp_path / "b.vrt").path == tmp_path / "b.vrt"
+    (tmp_path / "b.vrt").rename(tmp_path / "b.tif")
+    with pytest.raises(ChangeError, match=r"b\.tif refers to other files or addresses \(VRT\)"):
+        open_surface(tmp_path / "b.tif")
+
+
 def test_a_surface_that_is_shifted_is_moved_to_the_east_and_north(tmp_path: Path):
     path = write_surface(tmp_path / "a.tif", plane(80, 100, 0.5))
     grid = common_grid([open_surface(path)])

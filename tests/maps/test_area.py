@@ -1,4 +1,4 @@
-"""Areas and sections of GeoJSON files, as GIS programs write them."""
+"""Areas and sections, as GIS programs write them."""
 
 import json
 from pathlib import Path
@@ -45,7 +45,7 @@ def write(path: Path, *geometries: Any, **members: Any) -> Path:
 
 
 def area(path: Path) -> float:
-    return shapely.union_all([shape for shape, _ in read_shapes(path, FRAME, ("Polygon",))]).area
+    return shapely.union_all([shape for shape, _ in read_shapes(path, FRAME, "Polygon")]).area
 
 
 @pytest.mark.parametrize(
@@ -62,10 +62,32 @@ def test_all_valid_forms_of_an_area_are_read(tmp_path: Path, geometries: list[An
     assert area(write(tmp_path / "a.geojson", *geometries, **members)) == pytest.approx(SIDE**2, rel=1e-4)
 
 
+@pytest.mark.parametrize("name", ["a.gpkg", "a.shp"])
+def test_areas_are_read_from_other_formats_in_their_own_system(tmp_path: Path, name: str):
+    pytest.importorskip("pyogrio").raw.write(
+        tmp_path / name,
+        geometry=shapely.to_wkb(np.array([shapely.box(EAST, NORTH, EAST + SIDE, NORTH + SIDE)], object)),
+        field_data=[np.array(["flat"], object)],
+        fields=["name"],
+        geometry_type="Polygon",
+        crs="EPSG:27700",
+    )
+    [(found, title)] = read_shapes(tmp_path / name, FRAME, "Polygon")
+    assert (found.bounds, title) == ((EAST, NORTH, EAST + SIDE, NORTH + SIDE), "flat")
+
+
+def test_a_file_that_refers_to_other_data_is_refused(tmp_path: Path):
+    other = write(tmp_path / "other.geojson", polygon(SQUARE))
+    source = f"<OGRVRTLayer name='other'><SrcDataSource>{other}</SrcDataSource></OGRVRTLayer>"
+    (tmp_path / "a.geojson").write_text(f"<OGRVRTDataSource>{source}</OGRVRTDataSource>")
+    with pytest.raises(RunError, match=r"a\.geojson refers to other data: expected polygons or lines as GeoJSON"):
+        read_shapes(tmp_path / "a.geojson", FRAME, "Polygon")
+
+
 @pytest.mark.parametrize("frame", [FRAME, LOCAL])
 def test_an_outline_that_crosses_itself_has_the_inside_of_both_its_parts(tmp_path: Path, frame: MapFrame):
     path = write(tmp_path / "a.geojson", polygon(BOW_TIE))
-    shapes = [shape for shape, _ in read_shapes(path, frame, ("Polygon",))]
+    shapes = [shape for shape, _ in read_shapes(path, frame, "Polygon")]
     assert [shape.geom_type for shape in shapes] == ["Polygon", "Polygon"]
     assert all(shape.is_valid for shape in shapes)
     box = shapely.box(*shapely.union_all(shapes).bounds)
@@ -80,17 +102,17 @@ def test_coordinates_that_are_not_finite_are_refused(tmp_path: Path, frame: MapF
     path = write(tmp_path / "a.geojson", geometry)
     path.write_text(path.read_text().replace(json.dumps(SQUARE[1][1]), number))
     with pytest.raises(RunError, match=r"has coordinates outside of|is no GeoJSON"):
-        read_shapes(path, frame, (kind,))
+        read_shapes(path, frame, kind)
 
 
 def test_lines_keep_their_vertices(tmp_path: Path):
     line = {"type": "LineString", "coordinates": BOW_TIE}
-    ((found, about),) = read_shapes(write(tmp_path / "a.geojson", line), FRAME, ("LineString",))
+    ((found, name),) = read_shapes(write(tmp_path / "a.geojson", line), FRAME, "LineString")
     assert len(found.coords) == 5
-    assert about == {"name": "a"}
+    assert name == "a"
     spot = {"type": "LineString", "coordinates": [SQUARE[0], SQUARE[0]]}
     with pytest.raises(RunError, match="has no LineString"):
-        read_shapes(write(tmp_path / "a.geojson", spot), FRAME, ("LineString",))
+        read_shapes(write(tmp_path / "a.geojson", spot), FRAME, "LineString")
 
 
 def test_an_area_has_the_cells_and_tiles_that_lie_in_it_not_in_its_rectangle():
@@ -114,7 +136,7 @@ def test_an_area_has_the_cells_and_tiles_that_lie_in_it_not_in_its_rectangle():
     [
         ({"area": "notes.txt"}, "notes.txt is no GeoJSON"),
         ({"sections": "notes.txt"}, "notes.txt is no GeoJSON"),
-        ({"sections": "missing.geojson"}, "missing.geojson is no file"),
+        ({"sections": "missing.geojson"}, "missing.geojson is not a file"),
         ({"area": "line.geojson"}, "line.geojson has no Polygon"),
         ({"gsd": -0.1}, "--gsd -0.1"),
     ],

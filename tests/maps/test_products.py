@@ -278,7 +278,7 @@ def test_sections_interpolate_and_end_where_the_map_ends(tmp_path: Path, monkeyp
     dsm, sigma = written(tmp_path / "dsm.tif", plane), written(tmp_path / "sigma.tif", np.full(plane.shape, 0.5))
     monkeypatch.setattr(rasters, "BLOCK", block)
     line = LineString([(20.03, 70.01), (30.0, 80.0), (70.0, 80.0)])
-    [section] = cut([(line, {"name": "creek, mouth"})], dsm, sigma, GRID)
+    [section] = cut([(line, "creek, mouth")], dsm, sigma, GRID)
     known = np.isfinite(section.height)
     truth = 0.1 * section.place[:, 0] - 0.2 * section.place[:, 1]
     np.testing.assert_allclose(section.height[known], truth[known], atol=1e-4)

@@ -18,7 +18,7 @@ from scipy.ndimage import maximum_filter
 
 from tidefield.change.m3c2 import Distances, fit_normals, m3c2
 from tidefield.change.registration import Registration
-from tidefield.change.surfaces import ChangeError, Grid, is_local, system_of_ground, unstated_unit, values_at
+from tidefield.change.surfaces import ChangeError, Grid, system_of_ground, unstated_unit, values_at
 from tidefield.errors import need
 from tidefield.files import reading_from
 from tidefield.geometry.geodesy import (
@@ -26,6 +26,7 @@ from tidefield.geometry.geodesy import (
     US_SURVEY_FOOT_M,
     has_unstated_unit,
     horizontal,
+    is_local,
     metres_per_height,
     same_system,
     vertical_datum_of,

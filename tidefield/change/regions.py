@@ -1,30 +1,20 @@
-"""Regions of a user: polygons and lines of GeoJSON, GeoPackage or shapefiles, on a grid."""
+"""Regions of a user: polygons and lines, on a grid."""
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import shapely
 from jaxtyping import Bool
-from pyproj import CRS, Transformer
-from pyproj.exceptions import ProjError
+from pyproj import CRS
 from scipy.ndimage import maximum_filter
 from shapely.geometry.base import BaseGeometry
 
-from tidefield.change.surfaces import ChangeError, Grid, is_local
+from tidefield.change.surfaces import ChangeError, Grid
 from tidefield.errors import need
-from tidefield.geometry.geodesy import lost_in_conversion
-
-_log = logging.getLogger(__name__)
-
-_MOST_REGIONS = 10_000
-_LARGEST_FILE = 1 << 28
-_NAMES = ("name", "id", "label", "title", "location", "tr_id")
+from tidefield.geometry.drawn import read_drawn
 
 
 @dataclass(frozen=True)
@@ -60,100 +50,29 @@ def rasterised(regions: list[Region], grid: Grid) -> Bool[np.ndarray, "rows colu
     return cells.view(bool)
 
 
-def _converted(to: Transformer, points: np.ndarray) -> np.ndarray:
-    return np.stack(to.transform(points[:, 0], points[:, 1]), axis=1)
-
-
-def _name(value: Any) -> str:
-    """A name in a column; empty where there is none. Whole numbers beside missing ones are read as floats."""
-    if isinstance(value, np.ndarray | list | tuple):
-        return ", ".join(filter(None, map(_name, value)))
-    if value is None or value != value:  # NaN and NaT differ from themselves
-        return ""
-    return str(int(value)) if isinstance(value, float | np.floating) and value.is_integer() else str(value)
-
-
-def _layer(path: Path, layers: list[str], asked: str | None) -> str:
-    """The layer that is read of those with geometries."""
-    if asked is None and len(layers) == 1:
-        return layers[0]
-    if asked in layers:
-        return asked
-    if not layers:
-        raise ChangeError(f"{path} has no geometries: expected polygons or lines; name another file")
-    raise ChangeError(
-        f"{path} has {', '.join(layers)}: expected the name of one of these layers; write {path.name}:{layers[0]}"
-    )
-
-
 def read_regions(path: Path, grid: Grid) -> list[Region]:
     """Read all geometries of a file's layer, in the grid's system; no two have one name.
 
     Args:
         path: the file; "file.gpkg:layer" where it has several layers.
+        grid: of the surveys.
 
     Raises:
-        ChangeError: it cannot be read, is empty or too large, has several layers, or has no geometry on the grid.
+        RunError: as `read_drawn` and `Drawn.placed`.
+        ChangeError: it has no geometry on the grid.
     """
-    need("pyogrio")
-    from pyogrio import list_layers, raw, read_info
-    from pyogrio.errors import DataLayerError, DataSourceError
-
-    expected = "expected polygons as GeoJSON, GeoPackage or shapefile; name another file"
-    asked = None
-    if not path.is_file() and ":" in path.name:
-        name, asked = path.name.rsplit(":", 1)
-        path = path.with_name(name)
-    if not path.is_file():
-        raise ChangeError(f"{path} is not a file: {expected}")
-    if path.stat().st_size > _LARGEST_FILE:
-        raise ChangeError(
-            f"{path} has {path.stat().st_size / 1e6:.0f} MB, more than {_LARGEST_FILE / 1e6:.0f}: {expected}"
-        )
-    try:
-        layer = _layer(path, [str(name) for name, kind in list_layers(path) if kind is not None], asked)
-        about = read_info(path, layer=layer)
-        meta, _, shapes, columns = raw.read(path, layer=layer, max_features=_MOST_REGIONS + 1, force_2d=True)
-        geometries = shapely.from_wkb(shapes)
-    except (DataSourceError, DataLayerError, ValueError, shapely.errors.ShapelyError) as error:
-        raise ChangeError(f"{path} cannot be read as polygons ({error}): {expected}") from error
-    if len(geometries) > _MOST_REGIONS:
-        raise ChangeError(f"{path} has more than {_MOST_REGIONS} features: {expected}")
-    fields = [str(name) for name in meta["fields"]]
-    chosen = next((k for name in _NAMES for k, f in enumerate(fields) if f.lower() == name), None)
-    to = None
-    if about["crs"] and grid.crs is not None:
-        try:
-            crs = CRS(about["crs"])
-            # A file without a place on Earth, which GeoPackages call undefined, is taken to lie as the surveys do.
-            if not is_local(crs):
-                own = CRS.from_wkt(grid.crs)
-                to = Transformer.from_crs(crs, own, always_xy=True)
-                if lost := lost_in_conversion(crs, own):
-                    _log.warning(f"{path.name}: coordinates {lost}")
-        except ProjError as error:
-            raise ChangeError(
-                f"{path} cannot be converted to {CRS.from_wkt(grid.crs).name} ({error}): expected a system that fits "
-                "its place; assign it (ogr2ogr -a_srs)"
-            ) from error
-    frame = shapely.box(*grid.bounds)
+    drawn = read_drawn(path)
     found: list[Region] = []
     taken = {"all"}  # what tables call the whole survey
-    for k, geometry in enumerate(geometries):
-        if geometry is None or geometry.is_empty:
-            continue
-        if to is not None:
-            geometry = shapely.transform(geometry, partial(_converted, to))
-        if not np.isfinite(geometry.bounds).all():
-            raise ChangeError(f"{path} has a geometry at no place of the surveys' system: {expected}")
-        value = columns[chosen][k] if chosen is not None else None
-        name = own = _name(value) or str(k + 1)
+    for k, geometry in enumerate(drawn.placed(None if grid.crs is None else CRS.from_wkt(grid.crs))):
+        name = own = drawn.names[k] or str(k + 1)
         times = 1
         while name in taken:
             times += 1
             name = f"{own} ({times})"
         taken.add(name)
-        found.append(Region(name, shapely.make_valid(geometry)))
+        found.append(Region(name, geometry))
+    frame = shapely.box(*grid.bounds)
     if not any(region.geometry.intersects(frame) for region in found):
         raise ChangeError(
             f"nothing in {path} is where both surveys are: expected polygons there; check its coordinates"

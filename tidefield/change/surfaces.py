@@ -23,6 +23,7 @@ from tidefield.geometry.geodesy import (
     US_SURVEY_FOOT_M,
     has_unstated_unit,
     horizontal,
+    is_local,
     metres_per_height,
     metric_system,
     same_system,
@@ -42,6 +43,8 @@ _ELLIPSOID = "the ellipsoid"
 """How vertical datums of ellipsoidal heights are named."""
 _RESULTS = ("dz:", "hillshade", "photograph", "mean correlation", "significant", "plants:", "class")
 """How this program describes what is no height, nor an error of heights, in its rasters."""
+_REFERRING = ("EEDAI", "GTI", "PLMOSAIC", "STACIT", "STACTA", "VRT", "WCS", "WMS", "WMTS")
+"""GDAL's formats whose files refer to others, or to addresses; they are read only if their names say so."""
 _UNITS_M = {
     **dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 1.0),
     **dict.fromkeys(("ft", "foot", "feet", "international foot"), FOOT_M),
@@ -295,6 +298,11 @@ def opened(path: Path) -> Iterator[Any]:
         path.open("rb").close()
     try:
         with rasterio.Env(GDAL_CACHEMAX=128), rasterio.open(path) as dataset:
+            if dataset.driver in _REFERRING and dataset.driver.lower() != path.suffix[1:].lower():
+                raise ChangeError(
+                    f"{path} refers to other files or addresses ({dataset.driver}): expected a GeoTIFF, or a mosaic "
+                    "whose name ends in .vrt; name another, or rename it"
+                )
             yield dataset
     except rasterio.errors.RasterioIOError as error:
         raise ChangeError(
@@ -419,11 +427,6 @@ def date_in(text: str) -> str | None:
     """A date in a text, as YYYY-MM-DD, or None."""
     found = re.search(r"(?<!\d)(19|20)(\d\d)[-_:.]?(0[1-9]|1[0-2])[-_:.]?(0[1-9]|[12]\d|3[01])(?!\d)", text)
     return "{}{}-{}-{}".format(*found.groups()) if found else None
-
-
-def is_local(crs: CRS) -> bool:
-    """Whether a system is that of a scene without a georeference, as `tidefield map` states it."""
-    return crs.type_name == "Engineering CRS"
 
 
 def other_datums(earlier: Surface, later: Surface) -> str | None:

@@ -43,7 +43,7 @@ class Map:
     gsd: float | None = None
     """Ground sampling distance, the side of a cell, in metres; that of the photographs if not given."""
     area: Path | None = None
-    """Map only this polygon of a GeoJSON file."""
+    """Map only the polygons of this file (GeoJSON, GeoPackage, shapefile)."""
     heights: str | None = None
     """Vertical system of the scene's heights, such as EPSG:5701, where the scene does not state it."""
     check: Path | None = None
@@ -51,7 +51,7 @@ class Map:
     contours: float | None = None
     """Interval of the contours, in metres; a round one for about 20 contours if not given."""
     sections: Path | None = None
-    """Cut cross-sections along the lines of this GeoJSON file."""
+    """Cut cross-sections along the lines of this file (GeoJSON, GeoPackage, shapefile)."""
     fill: bool = False
     """Fill cells that fewer than two photographs see, and mark them in odm_dem/filled.tif."""
     device: Device = "auto"
@@ -66,7 +66,7 @@ def map_(options: Map, console: Console) -> dict[str, Any]:
     """Run `tidefield map`."""
     from tidefield.cluster import absolute, connected, share_of
     from tidefield.files import only_writer
-    from tidefield.maps.area import parse
+    from tidefield.maps.area import read_shapes
     from tidefield.maps.make import TileMaker, delete_tiles, finish_map, make_tiles
     from tidefield.progress import ProgressBar
 
@@ -79,7 +79,7 @@ def map_(options: Map, console: Console) -> dict[str, Any]:
         raise RunError(f"--gsd {options.gsd:g} was asked for: expected the side of a cell, above 0; choose another")
     for path, kind in ((options.area, "Polygon"), (options.sections, "LineString")):
         if path is not None:
-            parse(path, (kind,))
+            read_shapes(path, None, kind)
     with ExitStack() as stack:
         stack.enter_context(only_writer(options.out))
         opened = stack.enter_context(ExitStack())
@@ -154,11 +154,11 @@ def _open(options: Map, console: Console) -> Iterator[tuple[Job, Render, dict[st
         frame = map_frame(scene, georeference, options.heights)
         area, interval = None, options.contours and options.contours * frame.metre_up
         if options.area is not None:
-            area = union_all([shape for shape, _ in read_shapes(options.area, frame, ("Polygon",))])
+            area = union_all([shape for shape, _ in read_shapes(options.area, frame, "Polygon")])
         widest = max(file.lens.width for file in scene.photographs.files)
         full = scene if scene.cameras.width >= widest else at_width(scene, widest)
         grid = make_grid(frame, full, options.gsd, None if area is None else area.bounds)
-        lines = () if options.sections is None else tuple(read_shapes(options.sections, frame, ("LineString",)))
+        lines = () if options.sections is None else tuple(read_shapes(options.sections, frame, "LineString"))
         points = all_check_points(full, frame, options.check, georeference)
         job = Job(full, grid, area, options.fill, {"method": record}, tuple(points), interval, lines)
         yield job, render, {"scene": scene.root.resolve().name, "method": record}

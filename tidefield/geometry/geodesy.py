@@ -330,6 +330,11 @@ def same_system(one: CRS, other: CRS) -> bool:
     return horizontal(one).equals(horizontal(other), ignore_axis_order=True)
 
 
+def is_local(crs: CRS) -> bool:
+    """Whether a system is that of a scene without a georeference, as `tidefield map` states it."""
+    return crs.type_name == "Engineering CRS"
+
+
 def lost_in_conversion(crs: CRS, target: CRS) -> str | None:
     """What a conversion of plane coordinates lacks where PROJ has not the grid of the best one, which is metres then.
 

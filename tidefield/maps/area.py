@@ -1,114 +1,47 @@
-"""Read polygons and lines of GeoJSON files in a map's coordinates."""
+"""Polygons and lines of a user, in a map's coordinates."""
 
 from __future__ import annotations
 
-import json
-import logging
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import shapely
 from jaxtyping import Bool
-from pyproj import CRS, Transformer
-from pyproj.exceptions import CRSError
+from pyproj import CRS
 from shapely.geometry.base import BaseGeometry, BaseMultipartGeometry
 
 from tidefield.errors import RunError
-from tidefield.files import reading_from
-from tidefield.geometry.geodesy import WGS84, lost_in_conversion
+from tidefield.geometry.drawn import read_drawn
 from tidefield.maps.grid import MapFrame, Tile
 
-LARGEST = 1 << 25
-_NONE = "{path} has no {wanted}: expected at least one; draw it in a GIS and export it as GeoJSON"
-_log = logging.getLogger(__name__)
 
-
-def read_shapes(path: Path, frame: MapFrame, kinds: tuple[str, ...]) -> list[tuple[BaseGeometry, dict[str, Any]]]:
-    """Read the geometries of a GeoJSON file and their properties, in map coordinates.
-
-    Coordinates are longitude and latitude (RFC 7946), or those of the file's member `crs`, as GDAL writes it; with a
-    local frame, local ones.
+def read_shapes(path: Path, frame: MapFrame | None, kind: str) -> list[tuple[BaseGeometry, str]]:
+    """Read the geometries of a file and their names, in map coordinates; with a local frame, as they are.
 
     Args:
         path: the file.
-        frame: map coordinates.
-        kinds: of geometries that are wanted, such as "Polygon".
+        frame: map coordinates; None leaves those of the file.
+        kind: of geometries that are wanted: "Polygon" or "LineString".
 
     Raises:
-        RunError: as `parse`, or coordinates outside of the map's system.
+        RunError: as `read_drawn` and `Drawn.placed`, or the file has no such geometry.
     """
-    shapes, crs = parse(path, kinds)
-    shapes = [(part, about) for shape, about in shapes for part in _parts(shape, kinds)]
-    if frame.frame is not None:
-        target = CRS.from_wkt(frame.horizontal_wkt)
-        to_map = Transformer.from_crs(crs, target, always_xy=True)
-        if lost := lost_in_conversion(crs, target):
-            _log.warning(f"{path.name}: coordinates {lost}")
-
-        def converted(xy: np.ndarray) -> np.ndarray:
-            return np.column_stack(to_map.transform(*xy.T))
-
-        shapes = [(shapely.transform(shapely.force_2d(shape), converted), about) for shape, about in shapes]
-    if not all(np.isfinite(shapely.get_coordinates(shape)).all() for shape, _ in shapes):
-        expected = "local coordinates" if frame.frame is None else "longitude and latitude"
-        raise RunError(f"{path} has coordinates outside of {frame.name}: expected {expected} of the survey")
-    # An outline that crosses itself, as drawn by hand, has an inside all the same.
-    shapes = [(part, about) for shape, about in shapes for part in _parts(shapely.make_valid(shape), kinds)]
+    drawn = read_drawn(path)
+    target = None if frame is None or frame.frame is None else CRS.from_wkt(frame.horizontal_wkt)
+    placed = zip(drawn.placed(target), drawn.names, strict=True)
+    shapes = [(part, name) for shape, name in placed for part in _parts(shape, kind)]
     if not shapes:
-        raise RunError(_NONE.format(path=path, wanted=" or ".join(kinds)))
+        raise RunError(f"{path} has no {kind}: expected at least one; draw it in a GIS")
     return shapes
 
 
-def parse(path: Path, kinds: tuple[str, ...]) -> tuple[list[tuple[BaseGeometry, dict[str, Any]]], CRS]:
-    """The geometries of a GeoJSON file, of any kind, with their properties, and the system of their coordinates.
-
-    Args:
-        path: the file.
-        kinds: of geometries that are wanted.
-
-    Raises:
-        RunError: the file is missing, too large, no GeoJSON, or has none of these geometries.
-    """
-    wanted = " or ".join(kinds)
-    with reading_from(path):
-        if not path.is_file() or path.stat().st_size > LARGEST:
-            raise RunError(f"{path} is no file of at most {LARGEST >> 20} MB: expected a GeoJSON file with a {wanted}")
-        text = path.read_bytes()
-    try:
-        data = json.loads(text)
-        features = data["features"] if data.get("type") == "FeatureCollection" else [data]
-        with np.errstate(invalid="ignore"):  # `read_shapes` refuses what is not finite
-            shapes = [
-                (shapely.geometry.shape(geometry), dict(feature.get("properties") or {}))
-                for feature in features
-                if (geometry := feature.get("geometry", feature)) is not None  # RFC 7946, 3.2: it has no place
-            ]
-        named = (data.get("crs") or {}).get("properties", {}).get("name")
-        crs = CRS.from_user_input(named) if named else CRS.from_user_input(WGS84)
-    except (
-        ValueError,
-        KeyError,
-        TypeError,
-        AttributeError,
-        RecursionError,
-        OverflowError,
-        CRSError,
-        shapely.errors.ShapelyError,
-    ) as error:
-        raise RunError(f"{path} is no GeoJSON ({error}): expected a file with a {wanted}; export it again") from error
-    if not any(True for shape, _ in shapes for _ in _parts(shape, kinds)):
-        raise RunError(_NONE.format(path=path, wanted=wanted))
-    return shapes, crs
-
-
-def _parts(shape: BaseGeometry, kinds: tuple[str, ...]) -> Iterator[BaseGeometry]:
-    """The geometries of these kinds in a collection of collections."""
+def _parts(shape: BaseGeometry, kind: str) -> Iterator[BaseGeometry]:
+    """The geometries of a kind in a collection of collections."""
     if isinstance(shape, BaseMultipartGeometry):
         for part in shape.geoms:
-            yield from _parts(part, kinds)
-    elif shape.geom_type in kinds and not shape.is_empty:
+            yield from _parts(part, kind)
+    elif shape.geom_type == kind and not shape.is_empty:
         yield shape
 
 

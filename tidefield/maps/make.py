@@ -101,7 +101,7 @@ class Job:
         settings: what else the tiles depend on, for resuming.
         check_points: surveyed points that the map is compared with.
         interval: between contours, vertical units; a round one if None.
-        sections: lines to cut the surface along, and their properties.
+        sections: lines to cut the surface along, and their names.
     """
 
     scene: Scene
@@ -111,7 +111,7 @@ class Job:
     settings: dict[str, Any]
     check_points: tuple[CheckPoint, ...] = ()
     interval: float | None = None
-    sections: tuple[tuple[BaseGeometry, dict[str, Any]], ...] = ()
+    sections: tuple[tuple[BaseGeometry, str], ...] = ()
 
     @cached_property
     def tile_side(self) -> int:

@@ -40,22 +40,21 @@ class Section:
     sigma: Float64[np.ndarray, " N"]
 
 
-def cut(lines: Sequence[tuple[BaseGeometry, dict[str, Any]]], dsm: Path, sigma: Path, grid: Grid) -> list[Section]:
+def cut(lines: Sequence[tuple[BaseGeometry, str]], dsm: Path, sigma: Path, grid: Grid) -> list[Section]:
     """Cut a surface along lines, a point every cell.
 
     Args:
-        lines: in map coordinates, with their properties, of which `name` or `id` names them.
+        lines: in map coordinates, with their names, "" for a number.
         dsm, sigma: rasters of heights and their standard errors.
         grid: of the rasters.
     """
     result = []
-    for number, (line, about) in enumerate(lines, start=1):
+    for number, (line, name) in enumerate(lines, start=1):
         count = int(min(max(2, np.ceil(line.length / grid.cell) + 1), MOST_POINTS))
         along = np.linspace(0, line.length, count)
         place = np.array([line.interpolate(d).coords[0][:2] for d in along], dtype=np.float64)
         height, error = sample([dsm, sigma], place, grid).T
-        name = str(about.get("name") or about.get("id") or f"section {number}")
-        result.append(Section(name, along, place, height, error))
+        result.append(Section(name or f"section {number}", along, place, height, error))
     return result
 
 

@@ -23,11 +23,11 @@ from PIL import Image
 
 from tidefield.change.errors import Z95, Variogram, colour_limit, region_error
 from tidefield.change.inputs import ORTHOPHOTOS, SURFACES, first_of
-from tidefield.change.surfaces import PLAIN, Surface, date_in, is_local, open_surface, opened, system_of_ground
+from tidefield.change.surfaces import PLAIN, Surface, date_in, open_surface, opened, system_of_ground
 from tidefield.change.volumes import Volume
 from tidefield.errors import RunError
 from tidefield.files import read_json
-from tidefield.geometry.geodesy import in_metres, same_system
+from tidefield.geometry.geodesy import in_metres, is_local, same_system
 from tidefield.maps.grid import LOCAL_NAME
 
 TILE_PX = 256
