@@ -154,6 +154,21 @@ def test_points_are_placed_by_the_observations_of_the_photographs_used_alone(tmp
     assert_allclose(nearest, 0, atol=1e-5)
 
 
+def test_points_are_placed_alike_all_at_once_and_a_few_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    disk.write_colmap(tmp_path, disk.survey())
+    posed = read_posed(tmp_path, False)
+    assert posed.points is not None
+    shuffled = np.random.default_rng(0).permutation(len(posed.points.uv_px))
+    arrays = {name: getattr(posed.points, name)[shuffled] for name in ("point_index", "photograph_index", "uv_px")}
+    found = []
+    for at_once in (1 << 20, 7):
+        monkeypatch.setattr(triangulate, "_AT_ONCE", at_once)
+        points = replace(posed.points, **arrays)
+        found.append(triangulate.triangulate_again(points, posed.T_world_camera, posed.lenses, range(9)))
+    for name in ("xyz_world", "point_index", "photograph_index", "uv_px"):
+        np.testing.assert_array_equal(*(getattr(points, name) for points in found))
+
+
 def test_points_whose_rays_are_nearly_parallel_are_dropped(tmp_path: Path):
     truth = disk.survey()
     far = replace(truth, ground=truth.ground * (1, 1, 0) - (0, 0, 3000))

@@ -91,6 +91,14 @@ def test_photographs_that_agree_are_left_alone():
     np.testing.assert_array_equal(correction.falloff, 0)
 
 
+def test_one_point_says_nothing_of_exposures():
+    scene = shaded(GAINS, FALLOFF)
+    assert scene.points is not None
+    middle = scene.points.xyz_world.norm(dim=1).argmin()
+    points = scene.points.subset(torch.arange(1500) == middle)
+    assert not estimate_correction(replace(scene, points=points), [0] * 12, always=True).helps
+
+
 def test_gains_without_falloff_see_no_falloff():
     correction = estimate_correction(shaded(GAINS, np.zeros(3)), [0] * 12)
     assert correction.helps

@@ -22,6 +22,8 @@ from tidefield.survey.sfm.mapping import (
     _compare_heights,
     best_of,
     choose_lens,
+    find_models,
+    large_enough,
     lens_notes,
     reconstruct,
     registered_names,
@@ -233,6 +235,40 @@ def test_ctrl_c_ends_the_global_mapper_because_it_has_a_process_of_its_own(
     monkeypatch.setattr(pycolmap, "global_mapping", Mock(side_effect=AssertionError("not in this process")))
     (model,) = reconstruct(tmp_path / "database.db", tmp_path / "models", names, quiet, known=False, mapper="global")
     assert registered_names(model) == sorted(names)
+
+
+def test_a_photograph_that_sees_no_point_is_in_no_model(tmp_path: Path):
+    names = simulated_matches(tmp_path / "database.db")
+    with pycolmap.Database.open(tmp_path / "database.db") as db:
+        other = db.read_image_with_name(names[0])
+        lens = pycolmap.Camera.create_from_model_name(99, "PINHOLE", 500.0, 640, 480)
+        lens.has_prior_focal_length = True
+        db.write_camera(lens, use_camera_id=True)
+        rig = pycolmap.Rig(rig_id=99)
+        rig.add_ref_sensor(lens.sensor_id)
+        db.write_rig(rig, use_rig_id=True)
+        image = pycolmap.Image(name="stray.jpg", camera_id=99)
+        image.image_id = db.write_image(image)
+        frame = pycolmap.Frame(rig_id=99)
+        frame.add_data_id(image.data_id)
+        db.write_frame(frame)
+        random = np.random.default_rng(0)
+        db.write_keypoints(image.image_id, random.uniform(0, 480, (200, 4)).astype(np.float32))
+        by_chance = np.stack([np.arange(20), np.arange(20)], axis=1).astype(np.uint32)
+        kind = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+        geometry = pycolmap.TwoViewGeometry(config=kind, inlier_matches=by_chance)
+        db.write_two_view_geometry(other.image_id, image.image_id, geometry)
+    work = (tmp_path / "database.db", tmp_path / "models", [*names, "stray.jpg"])
+    (model,) = find_models(*work, quiet, True, "global", 1)
+    assert registered_names(model) == sorted(names)
+    assert 99 not in model.cameras
+
+
+def test_an_early_attempt_whose_photographs_are_in_a_later_one_is_no_model(tmp_path: Path):
+    whole, part = fly().model, pycolmap.Reconstruction(fly().model)
+    for image in list(part.images.values())[3:]:
+        part.deregister_frame(image.frame_id)
+    assert large_enough([whole, part], tmp_path / "none", []) == [whole]
 
 
 def test_a_killed_process_of_the_global_mapper_is_one_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

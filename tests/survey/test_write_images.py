@@ -13,7 +13,8 @@ from PIL.ExifTags import GPS, IFD, Base
 
 from tidefield.data.pictures import decode, read_header
 from tidefield.errors import RunError
-from tidefield.survey.colour import ExposureCorrection
+from tidefield.survey import export
+from tidefield.survey.colour import ExposureCorrection, to_common_exposure
 from tidefield.survey.export import (
     reduced_folders,
     tangent_map,
@@ -253,6 +254,24 @@ def test_other_files_in_the_folder_stay(photographs, tmp_path: Path):
     (tmp_path / "images" / "notes.txt").write_bytes(b"mine")
     write_images(photographs, tmp_path / "images", None, LENSES, quiet)
     assert (tmp_path / "images" / "notes.txt").read_bytes() == b"mine"
+
+
+def test_angles_are_found_once_for_each_lens_that_darkens(photographs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    found = []
+    monkeypatch.setattr(export, "tangent_map", lambda camera: found.append(camera) or tangent_map(camera))
+    asked = correction([1, 1, 1], falloff=-0.4)
+    asked.falloff[2] = 0
+    write_images(photographs, tmp_path / "images", asked, LENSES, quiet)
+    assert found == [LENS]
+
+
+def test_nothing_is_black_where_a_lens_images_no_point():
+    lens = pycolmap.Camera(model="SIMPLE_RADIAL", width=160, height=120, params=[100, 80, 60, -0.25], camera_id=1)
+    found = tangent_map(lens)
+    assert np.isfinite(found).all()
+    assert found[0, 0] == found.max()
+    even = np.full((120, 160, 3), 120, np.uint8)
+    assert to_common_exposure(even, np.ones(3), np.array([-0.05, 0.02, -0.01]), found).min() >= 100
 
 
 def test_interpolated_angles_equal_the_lens_model():

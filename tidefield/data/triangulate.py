@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Float64, Int64, UInt8
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from tidefield.data.cache import POINTS_SUFFIX, Arrays, cache_folder, identity, kept_arrays, key
 from tidefield.data.images import Progress
@@ -49,6 +49,8 @@ LEAST_ANGLE_DEG = 0.5
 """Between the rays of a point, whose depth is otherwise a guess."""
 _STEPS = 5
 """Of Gauss-Newton, which from the point nearest to the rays has then converged."""
+_AT_ONCE = 200_000
+"""Observations that are placed together: each takes some 600 bytes meanwhile."""
 FEWEST = 100
 """Fewer points do not tell where a scene's surface is."""
 
@@ -286,32 +288,17 @@ def triangulate_again(
     good &= (np.bincount(point[good], minlength=len(points.xyz_world)) >= 2)[point]
     point, photograph, uv, xy, focal = point[good], photograph[good], uv[good], xy[good], focal[good]
     kept, point = np.unique(point, return_inverse=True)
-    R, centre = T_world_camera[photograph, :, :3], T_world_camera[photograph, :, 3]
-
-    def total(values: Float64[np.ndarray, "O *D"]) -> Float64[np.ndarray, "P *D"]:
-        """Sums over the observations of each point."""
-        flat = values.reshape(len(values), math.prod(values.shape[1:]))
-        sums = [np.bincount(point, weights=column, minlength=len(kept)) for column in flat.T]
-        return np.stack(sums, axis=1).reshape(len(kept), *values.shape[1:]).astype(np.float64)
-
-    ray = np.einsum("oij,oj->oi", R, np.column_stack([xy, np.ones(len(xy))]))
-    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-    across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
-    normal = total(across)
-    # Of two rays at an angle a, the smallest eigenvalue is 1 - cos a, about a^2 / 2.
-    angle = 2 * np.sqrt(np.linalg.eigvalsh(normal)[:, 0].clip(0) / np.bincount(point, minlength=len(kept)))
-    wide = angle > np.deg2rad(LEAST_ANGLE_DEG)
-    normal[~wide] = np.eye(3)
-    xyz = np.linalg.solve(normal, total(np.einsum("oij,oj->oi", across, centre))[..., None])[..., 0]
-    for _ in range(_STEPS):
-        projected, slope = project_with_slopes(T_world_camera[photograph], xyz[point])
-        slope = slope * focal[:, None, None]
-        error = (projected - xy) * focal[:, None]
-        normal = total(slope @ slope.transpose(0, 2, 1))
-        normal += 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-        normal[~wide] = np.eye(3)
-        xyz -= np.linalg.solve(normal, total(np.einsum("oij,oj->oi", slope, error))[..., None])[..., 0]
-    wide &= np.isfinite(xyz).all(axis=1)
+    xyz, wide = np.empty((len(kept), 3)), np.empty(len(kept), dtype=bool)
+    order = np.argsort(point, kind="stable")
+    ends = np.cumsum(np.bincount(point, minlength=len(kept)))
+    first = 0
+    while first < len(kept):
+        start = int(ends[first - 1]) if first else 0
+        last = max(first + 1, int(np.searchsorted(ends, start + _AT_ONCE, side="right")))
+        part = order[start : ends[last - 1]]
+        T, some = T_world_camera[photograph[part]], slice(first, last)
+        xyz[some], wide[some] = _placed(point[part] - first, last - first, T, xy[part], focal[part])
+        first = last
     seen = wide[point]
     return Observations(
         xyz_world=xyz[wide],
@@ -320,6 +307,42 @@ def triangulate_again(
         uv_px=uv[seen],
         rgb=None if points.rgb is None else points.rgb[kept][wide],
     )
+
+
+def _placed(
+    point: Int64[np.ndarray, " O"],
+    count: int,
+    T_world_camera: Float64[np.ndarray, "O 3 4"],
+    xy: Float64[np.ndarray, "O 2"],
+    focal: Float64[np.ndarray, " O"],
+) -> tuple[Float64[np.ndarray, "P 3"], Bool[np.ndarray, " P"]]:
+    """Place points by all of their observations; returns the places, and whether their rays are far from parallel."""
+    R, centre = T_world_camera[:, :, :3], T_world_camera[:, :, 3]
+
+    def total(values: Float64[np.ndarray, "O *D"]) -> Float64[np.ndarray, "P *D"]:
+        """Sums over the observations of each point."""
+        flat = values.reshape(len(values), math.prod(values.shape[1:]))
+        sums = [np.bincount(point, weights=column, minlength=count) for column in flat.T]
+        return np.stack(sums, axis=1).reshape(count, *values.shape[1:]).astype(np.float64)
+
+    ray = np.einsum("oij,oj->oi", R, np.column_stack([xy, np.ones(len(xy))]))
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
+    normal = total(across)
+    # Of two rays at an angle a, the smallest eigenvalue is 1 - cos a, about a^2 / 2.
+    angle = 2 * np.sqrt(np.linalg.eigvalsh(normal)[:, 0].clip(0) / np.bincount(point, minlength=count))
+    wide = angle > np.deg2rad(LEAST_ANGLE_DEG)
+    normal[~wide] = np.eye(3)
+    xyz = np.linalg.solve(normal, total(np.einsum("oij,oj->oi", across, centre))[..., None])[..., 0]
+    for _ in range(_STEPS):
+        projected, slope = project_with_slopes(T_world_camera, xyz[point])
+        slope = slope * focal[:, None, None]
+        error = (projected - xy) * focal[:, None]
+        normal = total(slope @ slope.transpose(0, 2, 1))
+        normal += 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+        normal[~wide] = np.eye(3)
+        xyz -= np.linalg.solve(normal, total(np.einsum("oij,oj->oi", slope, error))[..., None])[..., 0]
+    return xyz, wide & np.isfinite(xyz).all(axis=1)
 
 
 def _quiet() -> None:

@@ -75,7 +75,7 @@ def estimate_correction(scene: Scene, lenses: Sequence[int], always: bool = Fals
     nothing = np.zeros((len(scene.cameras), 3))
     points = scene.points
     seen = None if points is None else observe(scene.photographs, scene.cameras, points, scene.train)
-    if points is None or seen is None or not len(seen.value):
+    if points is None or seen is None or len(np.unique(seen.point)) < 2:  # one to estimate by, one to test
         return ExposureCorrection(np.exp(nothing), nothing, np.nan, np.nan, np.nan, False, False)
     lens = np.unique(np.asarray(lenses, dtype=np.int64), return_inverse=True)[1]
     uv = points.uv_px[torch.from_numpy(seen.row)].double()

@@ -72,8 +72,9 @@ def write_images(
     folder.mkdir(parents=True, exist_ok=True)
     if correction is not None and not correction.helps:
         correction = None
-    has_falloff = correction is not None and correction.sees_falloff
-    tangents = {camera.camera_id: tangent_map(camera) for camera in cameras} if has_falloff else {}
+    falloffs = np.zeros((len(cameras), 3)) if correction is None else correction.falloff
+    darkening = {camera.camera_id: camera for camera, terms in zip(cameras, falloffs, strict=True) if terms.any()}
+    tangents = {number: tangent_map(camera) for number, camera in darkening.items()}
 
     def write(index: int) -> None:
         photograph = photographs[index]
@@ -232,16 +233,22 @@ def write_masks(photographs: Sequence[Photograph], folder: Path) -> None:
 
 
 def tangent_map(camera: pycolmap.Camera) -> Float32[np.ndarray, "H W"]:
-    """Compute the tangent of the angle between each pixel's ray and the optical axis."""
+    """Compute the tangent of the angle between each pixel's ray and the optical axis.
+
+    Beyond a fold, where the lens images no point, and beyond the widest angle of a fisheye that is shown, it is the
+    largest that is shown: the falloff there is unknown.
+    """
     # From the centre of the first pixel to that of the last, so that nothing is extrapolated.
     columns, rows = (max(2, 1 + -(-size // GRID_PX)) for size in (camera.width, camera.height))
     u, v = np.linspace(0.5, camera.width - 0.5, columns), np.linspace(0.5, camera.height - 0.5, rows)
     uv = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
-    tangent = np.linalg.norm(np.asarray(camera.cam_from_img(uv)), axis=1)
     lens = lens_from_colmap(camera.model_name, camera.width, camera.height, camera.params)
-    if isinstance(lens, FisheyeLens):  # farther out, the falloff is unknown, and beyond 90 degrees there is no tangent
+    tangent = np.linalg.norm(lens.unproject(uv), axis=1)
+    largest = np.nanmax(tangent)
+    if isinstance(lens, FisheyeLens):
         corners = lens.pinhole().unproject(np.array([(0.0, 0.0), (lens.width, lens.height)]))
-        tangent = np.fmin(np.linalg.norm(lens.unproject(uv), axis=1), np.linalg.norm(corners, axis=1).max())
+        largest = np.linalg.norm(corners, axis=1).max()
+    tangent = np.fmin(tangent, largest)
     grid = tangent.reshape(rows, columns).astype(np.float32)
     column = np.linspace(0, columns - 1, camera.width, dtype=np.float32)
     row = np.linspace(0, rows - 1, camera.height, dtype=np.float32)

@@ -320,7 +320,8 @@ def estimate_poses(
     with ProgressBar(console, "Choosing a lens") as bar:
         choice = choose_lens(models[0], survey.photographs, known, bar, largest)
     write_model(models[0], folder)
-    shutil.rmtree(folder.with_name("blocks"), ignore_errors=True)
+    for work in ("blocks", "models"):
+        shutil.rmtree(folder.with_name(work), ignore_errors=True)
     return {"models": [registered_names(model) for model in models], "lens": _to_json(choice)}
 
 

@@ -36,6 +36,7 @@ from tidefield.survey.georeference.bundle_adjustment import all_images, solve, t
 from tidefield.survey.georeference.gps_alignment import PositionFit, fit_positions, given_positions, rms_m
 from tidefield.survey.sfm.features import decode_name, encode_name, set_up_pycolmap
 from tidefield.survey.sfm.model_files import read_model, write_model
+from tidefield.survey.sfm.placing import MIN_INLIERS
 from tidefield.survey.survey import Photograph, Progress
 
 Result = TypeVar("Result")
@@ -261,21 +262,34 @@ def _map_globally(
     options.num_threads = options.num_threads if threads is None else threads
     options.min_model_size = MIN_PHOTOGRAPHS
     options.mapper.bundle_adjustment.refine_focal_length = not known
-    return pycolmap.global_mapping(database, folder, folder, options)
+    models = pycolmap.global_mapping(database, folder, folder, options)
+    for model in models.values():
+        # Each photograph that a pair connects gets a pose, whether or not it sees any point afterwards.
+        for number in list(model.reg_image_ids()):
+            if model.image(number).num_points3D < MIN_INLIERS:
+                model.deregister_frame(model.image(number).frame_id)
+        model.tear_down()
+    return models
 
 
 def large_enough(
     models: list[pycolmap.Reconstruction], database: Path, names: Collection[str]
 ) -> list[pycolmap.Reconstruction]:
-    """Select the models of three photographs or more from those of `find_models`.
+    """Select the models of three photographs or more from those of `find_models`, the largest first.
+
+    Incremental mapping may return an early attempt, all of whose photographs are in a later one.
 
     Raises:
         SurveyError: there is none; with what the photographs lack.
     """
-    large = [model for model in models if model.num_reg_images() >= MIN_PHOTOGRAPHS]
+    large: list[pycolmap.Reconstruction] = []
+    for model in models:
+        own = set(registered_names(model))
+        if len(own) >= MIN_PHOTOGRAPHS and not any(own <= set(registered_names(other)) for other in large):
+            large.append(model)
     if not large:
         fit = models[0].num_reg_images() if models else 0
-        reason = _why_so_few(database, [encode_name(name) for name in names])
+        reason = _why_so_few(database, {encode_name(name) for name in names})
         raise SurveyError(
             f"{fit or 'none'} of the {len(names)} photographs fit together ({reason}): expected "
             f"at least {MIN_PHOTOGRAPHS} that overlap by half or more and show ground with some texture; fly with more "
