@@ -329,6 +329,13 @@ def test_training_lowers_the_loss_and_leaves_a_checkpoint(scene: Scene, tmp_path
     assert all(torch.equal(v, weights(again)[n]) for n, v in weights(trainer).items())
 
 
+def test_no_batch_is_drawn_in_vain_without_a_gpu(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn, draw = [], SceneTrainer.draw
+    monkeypatch.setattr(SceneTrainer, "draw", lambda trainer: drawn.append(1) or draw(trainer))
+    assert train(SceneTrainer(SMALL, scene, seed=0, device=CPU), tmp_path, Budget(steps=3), Console(quiet=True)) is None
+    assert len(drawn) == 3
+
+
 def test_only_steps_count_as_time_of_training(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A step takes 3 seconds and draws the next batch in 1; preparing, pictures and callbacks take far longer."""
     clock = [0.0]

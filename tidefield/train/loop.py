@@ -295,6 +295,8 @@ class SceneTrainer(Trainer):
         return error.detach(), tuple(parameter.grad for parameter in self.network.parameters())
 
     def draw_ahead(self) -> None:
+        if self.device.type == "cpu":  # which is not waited for meanwhile; after the last step it would be in vain
+            return
         state = self.generator.get_state()
         self._ahead = state, self.draw()
 
