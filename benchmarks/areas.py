@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.records import MEASURED, HiddenRunner, say, show, store
+from benchmarks.records import MEASURED, NETWORK, HiddenRunner, network_of, require_same, say, show, store
 from tidefield.compare.run import run_measured, tidefield
 from tidefield.compare.tables import Table
 from tidefield.config import PRESETS, Budget
@@ -62,11 +62,15 @@ def areas(
         steps: Of the trainings whose memory is measured.
         compared_steps: Of the trainings at once and by areas that are compared.
         run: Runs a command.
+
+    Raises:
+        RunError: figures of quality and seams that are kept are of other weights.
     """
     record = read_json(runs / AREAS_FILE)
     about = {"width": width, "steps": steps, "compared_steps": compared_steps}
     if record is None or record["about"] != about:
         record = {"about": about, "memory": {}, "compared": {}}
+    record["compared"] = _by_count(record)
     plans = {count: LargeFlight(strips=count // EACH, each=EACH, width=width) for count in counts}
     for count, plan in plans.items():
         if str(count) in record["memory"]:
@@ -79,19 +83,30 @@ def areas(
         usage = run(tidefield(*words), {})
         new = record["memory"][str(count)] = {"seconds": usage.seconds, "peak_memory_bytes": usage.peak_memory_bytes}
         _store(record, new, runs)
-    smallest = plans[min(plans)]
-    for name in ("at once", "by areas"):
-        if name not in record["compared"]:
-            say(f"{min(plans)} photographs: {name}")
-            new = compare(_scene(smallest, work), smallest, name == "by areas", compared_steps)
-            record["compared"][name] = new
-            _store(record, new, runs)
+    fewest, network = min(plans), {NETWORK: network_of(work)}
+    compared = record["compared"].setdefault(str(fewest), {})
+    for way in ("at once", "by areas"):
+        name = f"{fewest} photographs: {way}"
+        if way in compared:
+            require_same(runs / AREAS_FILE, name, compared[way], network)
+            continue
+        say(name)
+        new = compare(_scene(plans[fewest], work), plans[fewest], way == "by areas", compared_steps)
+        compared[way] = {**new, **network}
+        _store(record, compared[way], runs)
     show(tables(record))
     return record
 
 
+def _by_count(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Comparisons by the number of photographs, which earlier versions did not store: it was that of the smallest."""
+    compared = record["compared"]
+    return {min(record["memory"], key=int): compared} if "at once" in compared else compared
+
+
 def _store(record: dict[str, Any], new: dict[str, Any], runs: Path) -> None:
-    figures = [*record["memory"].values(), *record["compared"].values()]
+    compared = [one for of in record["compared"].values() for one in of.values()]
+    figures = [*record["memory"].values(), *compared]
     store(runs / AREAS_FILE, record, new, figures, "python -m benchmarks areas")
 
 
@@ -213,18 +228,17 @@ def tables(record: Mapping[str, Any]) -> list[Table]:
     if len(memory) > 1:
         memory.append(("each further one", f"{slope_bytes(record) / 1e9:.6f}"))
     result = [Table(title, ["photographs", "peak, GB"], memory)]
-    if record["compared"]:
+    for count, ways in _by_count(record).items():
         rows = []
-        for name, of in record["compared"].items():
+        for name, of in ways.items():
             at = of["borders"]
             border = [f"{at[key]:.2f}" for key in ("border_mean", "border_mean_absolute", "border_largest")]
             inside = [f"{at[key]:.2f}" for key in ("inside_mean_absolute", "inside_largest")]
             rows.append((f"{name} ({of['areas']})", f"{of['psnr']:.2f}", *border, *inside))
         columns = ["training (areas)", "PSNR, dB", "at borders: mean", "mean size", "largest", "elsewhere: mean size"]
-        count = min(int(count) for count in record["memory"])
         title = (
-            f"{count:,} photographs, {about['compared_steps']:,} steps: quality of held-out views, and change of the "
-            "mean error across a line, in 255ths"
+            f"{int(count):,} photographs, {about['compared_steps']:,} steps: quality of held-out views, and change of "
+            "the mean error across a line, in 255ths"
         )
         result.append(Table(title, [*columns, "largest"], rows))
     return result

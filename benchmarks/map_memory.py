@@ -10,7 +10,7 @@ import os
 import resource
 import shutil
 import time
-from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -75,7 +75,7 @@ def map_memory(
 
     def bar(name: str) -> Any:
         say(name)
-        return _Quiet()
+        return nullcontext(lambda done, whole: None)
 
     started = time.monotonic()
     made = finish_map(large, out, {"scene": scene.name, "method": record}, bar)
@@ -102,16 +102,6 @@ def map_memory(
         f"{result['tile_seconds']:.0f} s a tile, {result['disk_bytes'] / 1e9:.1f} GB of files"
     )
     return result
-
-
-class _Quiet:
-    """A progress bar that shows nothing."""
-
-    def __enter__(self) -> Callable[[int, int], None]:
-        return lambda done, whole: None
-
-    def __exit__(self, *_: object) -> None:
-        return None
 
 
 def _peak() -> int:

@@ -34,20 +34,25 @@ def map_views(scene: Positional[Path], runs: Path = Path("runs/map_views"), half
 
     Args:
         scene: A built-in flat, such as one of those that maps makes.
-        runs: Folder for the map and map_views.json.
+        runs: Folder for the maps and map_views.json.
         half: Half the side of the square that is mapped, metres.
+
+    Raises:
+        RunError: the folder has a map of another scene of this name, or of another square.
     """
     loaded = load_scene(scene, hold_out=False)
     position = (loaded.cameras.position_world.double() + loaded.origin_world.double()).numpy()
     left_out = int(np.linalg.norm(position[:, :2], axis=1).argmin())
     name = loaded.names[left_out]
-    if not (runs / "scene").exists():
-        with completed_folder(runs / "scene") as partial:
-            shutil.copytree(scene / "images", partial / "images", ignore=shutil.ignore_patterns(Path(name).name))
-            shutil.copytree(scene / "sparse", partial / "sparse")
+    folder = runs / "_".join(scene.resolve().parts[-2:])  # those of `maps` are all named "scene"
+    # Copied each time, so that the map is compared with the scene that is given now.
+    shutil.rmtree(folder / "scene", ignore_errors=True)
+    with completed_folder(folder / "scene") as partial:
+        shutil.copytree(scene / "images", partial / "images", ignore=shutil.ignore_patterns(Path(name).name))
+        shutil.copytree(scene / "sparse", partial / "sparse")
     say(f"map without {name}")
-    made_map(runs / "scene", runs / "map", area=write_square(runs, half), allow_missing=True)
-    grid, height, sparse, colour = read_map(loaded, runs / "map")
+    made_map(folder / "scene", folder / "map", area=write_square(runs, half), allow_missing=True)
+    grid, height, sparse, colour = read_map(loaded, folder / "map")
     truth = loaded.photographs[left_out]
     view = View(loaded.cameras[left_out], whole(grid))
     result: dict[str, Any] = {"photograph": name, "cell_m": grid.cell}

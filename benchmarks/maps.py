@@ -20,7 +20,7 @@ from tidefield.compare.run import make_flat
 from tidefield.compare.tables import Table
 from tidefield.data.load import load_scene
 from tidefield.data.scene import Scene
-from tidefield.errors import need
+from tidefield.errors import RunError, need
 from tidefield.files import read_json, write_json
 from tidefield.maps.classes import GROUND, VEGETATION, WATER
 from tidefield.maps.grid import Grid, Tile, map_frame
@@ -56,16 +56,17 @@ def maps(
     record = read_json(runs / MAPS_FILE) or {"figures": {}}
     area = write_square(runs, half)
     for category in categories:
-        name = f"{category}, {width} px, {views} photographs"
+        name = f"{category}, {width} px, {views} photographs, {2 * half:g} x {2 * half:g} m"
         if name in record["figures"]:
             continue
         folder = runs / f"{category}_{width}_{views}"
+        scene, out = folder / "scene", folder / f"map_{half:g}"
         say(f"{name}: photographs")
-        make_flat(folder / "scene", category, SEED, views, width)
+        make_flat(scene, category, SEED, views, width)
         say(f"{name}: map")
-        made = made_map(folder / "scene", folder / "map", area=area)
+        made = made_map(scene, out, area=area)
         say(f"{name}: baselines")
-        record["figures"][name] = {**compare_with_truth(folder / "scene", folder / "map"), "seconds": made["seconds"]}
+        record["figures"][name] = {**compare_with_truth(scene, out), "seconds": made["seconds"]}
         command = f"python -m benchmarks maps --width {width} --views {views} --half {half:g}"
         store(runs / MAPS_FILE, record, record["figures"][name], record["figures"].values(), command)
     show(tables(record))
@@ -85,16 +86,26 @@ def made_map(scene: Path, out: Path, **options: Any) -> dict[str, Any]:
         scene: the scene's folder.
         out: the map's folder.
         options: further ones of the command.
+
+    Raises:
+        RunError: the folder holds another map, or the command failed.
     """
     from rich.console import Console
 
     from tidefield.commands.common import ZeroShot
-    from tidefield.commands.map_ import Map, map_
+    from tidefield.commands.map_ import Map, map_, open_job
 
+    asked, console = Map(scene, out, ZeroShot(zero_shot=True), **options), Console(quiet=True)
     made = read_json(out / MAP_FILE) or {}
-    if made.get("complete"):
-        return made
-    return map_(Map(scene, out, ZeroShot(zero_shot=True), **options), Console(quiet=True))
+    if not made.get("complete"):
+        return map_(asked, console)
+    with open_job(asked, console) as (job, _, _):
+        if made.get("key") != job.key:
+            raise RunError(
+                f"{out} has a map of another scene, of other weights or with other options: expected that which is "
+                "asked for; delete the folder to make it"
+            )
+    return made
 
 
 def compare_with_truth(root: Path, out: Path) -> dict[str, Any]:

@@ -9,11 +9,13 @@ import pytest
 import torch
 from networks import SMALL
 
-from benchmarks.areas import _in_world, areas, border_cameras, border_steps, slope_bytes, tables
+from benchmarks.areas import AREAS_FILE, _in_world, areas, border_cameras, border_steps, slope_bytes, tables
 from tidefield.compare.run import Usage
 from tidefield.config import PRESETS, Budget
 from tidefield.data.areas import cut
 from tidefield.data.load import load_scene
+from tidefield.errors import RunError
+from tidefield.files import read_json
 from tidefield.model.rendering import Rendering
 from tidefield.synthetic import Flight
 from tidefield.synthetic.large import LargeFlight, make_large_flight, planned_flight, write_large_scene
@@ -25,16 +27,18 @@ AREAS = partial(cut, whole=20, most=12)
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory):
-    folder = tmp_path_factory.mktemp("flight")
-    make_large_flight(PLAN, folder / "flight")
-    write_large_scene(PLAN, folder / "flight", folder / "scene")
-    return load_scene(folder / "scene", cache=folder / "cache")
+def flat():
+    return planned_flight(PLAN)[3]()
 
 
 @pytest.fixture(scope="module")
-def flat():
-    return planned_flight(PLAN)[3]()
+def scene(flat, tmp_path_factory: pytest.TempPathFactory):
+    folder = tmp_path_factory.mktemp("flight")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("tidefield.synthetic.large.make_flat", lambda *_: flat)  # it takes seconds each time
+        make_large_flight(PLAN, folder / "flight")
+        write_large_scene(PLAN, folder / "flight", folder / "scene")
+    return load_scene(folder / "scene", cache=folder / "cache")
 
 
 def test_views_over_borders_have_an_area_on_each_side(scene):
@@ -82,6 +86,12 @@ def test_training_by_areas_leaves_no_seam_on_flat_mud(scene, flat):
     assert found["border_mean_absolute"] < 1.5 * found["inside_mean_absolute"] + 0.2
 
 
+STEP = dict.fromkeys(
+    ("border_mean", "border_mean_absolute", "border_largest", "inside_mean_absolute", "inside_largest"), 0.25
+)
+COMPARED = {"areas": 8, "seconds": 9.0, "psnr": 30.0, "borders": {"views": 4, **STEP}}
+
+
 def test_what_is_stored_is_not_measured_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     calls: list[list[str]] = []
 
@@ -90,11 +100,7 @@ def test_what_is_stored_is_not_measured_again(tmp_path: Path, monkeypatch: pytes
         return Usage(3.0, 1_000_000_000 + 1000 * int(Path(command[4]).name.split("_")[1]))
 
     monkeypatch.setattr("benchmarks.areas._scene", lambda plan, work: work / f"scene_{plan.strips * plan.each}_96")
-    step = dict.fromkeys(
-        ("border_mean", "border_mean_absolute", "border_largest", "inside_mean_absolute", "inside_largest"), 0.25
-    )
-    compared = {"areas": 8, "seconds": 9.0, "psnr": 30.0, "borders": {"views": 4, **step}}
-    monkeypatch.setattr("benchmarks.areas.compare", lambda *_: compared)
+    monkeypatch.setattr("benchmarks.areas.compare", lambda *_: COMPARED)
     for _ in range(2):
         record = areas(tmp_path, tmp_path / "runs", (500, 1000), 96, 5, 7, run)
     assert [words[:2] for words in calls] == [["train", str(tmp_path / f"scene_{n}_96")] for n in (500, 1000)]
@@ -102,6 +108,32 @@ def test_what_is_stored_is_not_measured_again(tmp_path: Path, monkeypatch: pytes
     memory, seams = (table.markdown() for table in tables(record))
     assert "| 1,000 | 1.00 |" in memory
     assert "| by areas (8) | 30.00 | 0.25 | 0.25 | 0.25 | 0.25 | 0.25 |" in seams
+
+
+def test_comparisons_are_of_their_flight_and_of_their_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def compare(scene, plan, by_areas, steps):
+        return {**COMPARED, "psnr": plan.strips * plan.each / 100}
+
+    def measure(*counts: int) -> list[str]:
+        record = areas(tmp_path, tmp_path, counts, 96, 5, 7, lambda *_: Usage(1.0, 1))
+        return [table.markdown() for table in tables(record)[1:]]
+
+    monkeypatch.setattr("benchmarks.areas._scene", lambda plan, work: work)
+    monkeypatch.setattr("benchmarks.areas.compare", compare)
+    measure(500, 1000)
+    for page, title, psnr in zip(measure(100, 500), ("500", "100"), ("5.00", "1.00"), strict=True):
+        assert f"{title} photographs, 7 steps" in page
+        assert f"| at once (8) | {psnr} |" in page
+    monkeypatch.setattr("benchmarks.areas.network_of", lambda _: "other weights")
+    with pytest.raises(RunError, match=r"100 photographs: at once with network .* expected other weights"):
+        measure(100, 500)
+
+
+def test_comparisons_of_earlier_versions_are_shown_with_their_flight():
+    record = read_json(Path(__file__).parents[2] / "docs" / "measured" / AREAS_FILE)
+    _, seams = (table.markdown() for table in tables(record))
+    assert "500 photographs, 1,600 steps" in seams
+    assert "| by areas (8) | 34.65 |" in seams
 
 
 def test_a_view_does_not_depend_on_the_area_that_is_open(scene):

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
-from benchmarks.maps import _truth, errors, overlaps, semi_global, tables
+from benchmarks.maps import _truth, errors, made_map, maps, overlaps, semi_global, tables
+from tidefield.commands.map_ import Map
 from tidefield.data.load import load_scene
+from tidefield.errors import RunError
+from tidefield.files import read_json, write_json
 from tidefield.maps.grid import Grid, map_frame
 from tidefield.synthetic import make_survey, write_survey
 
@@ -57,6 +63,61 @@ def test_tables_show_what_was_stored():
     assert "31.3" in second.markdown()
     assert "| 25.0% | 50.0% | - |" in third.markdown()
     assert "| creek | 40 | -75.0 | +0.21 | 0.30 |" in fourth.markdown()
+
+
+def test_each_square_is_mapped_and_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    mapped, compared = [], []
+
+    def made_map(scene: Path, out: Path, area: Path) -> dict[str, float]:
+        mapped.append((out, read_json(area)["coordinates"][0][2]))
+        return {"seconds": 1.0}
+
+    monkeypatch.setattr("benchmarks.maps.make_flat", lambda *_: None)
+    monkeypatch.setattr("benchmarks.maps.made_map", made_map)
+    monkeypatch.setattr("benchmarks.maps.compare_with_truth", lambda scene, out: compared.append(out) or {"cells": 1})
+    monkeypatch.setattr("benchmarks.maps.tables", lambda record: [])
+    for half in (12.0, 6.0, 6.0):
+        maps(tmp_path, ("vegetation",), 2000, 20, half)
+    assert len(compared) == len(set(compared)) == 2
+    assert mapped == [(compared[0], [12.0, 12.0]), (compared[1], [6.0, 6.0])]
+
+
+def test_a_map_that_is_kept_is_the_one_that_is_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    @contextmanager
+    def opened(options: Map, console: object):
+        yield SimpleNamespace(key=str(options.gsd)), None, {}
+
+    monkeypatch.setattr("tidefield.commands.map_.open_job", opened)
+    made = {"complete": True, "key": "0.15", "seconds": 1}
+    write_json(tmp_path / "map.json", made)
+    assert made_map(tmp_path, tmp_path, gsd=0.15) == made
+    with pytest.raises(RunError, match="has a map of another scene, of other weights or with other options: expected"):
+        made_map(tmp_path, tmp_path, gsd=0.05)
+
+
+def test_a_photograph_is_left_out_of_the_scene_that_is_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    from benchmarks.map_views import map_views
+
+    left = []
+
+    def made_map(scene: Path, out: Path, **_: object) -> None:
+        left.append((scene, out, [file.name for file in scene.rglob("*.png")]))
+        raise RunError("as far as this")
+
+    cameras = SimpleNamespace(position_world=torch.tensor([[0.0, 0.0, 9.0], [4.0, 0.0, 9.0]]))
+    monkeypatch.setattr("benchmarks.map_views.made_map", made_map)
+    for name in ("first", "second", "second"):
+        scene, names = tmp_path / name / "scene", (f"{name}_1.png", f"{name}_2.png")
+        loaded = SimpleNamespace(cameras=cameras, origin_world=torch.zeros(3), names=names)
+        monkeypatch.setattr("benchmarks.map_views.load_scene", lambda *_, loaded=loaded, **__: loaded)
+        for part in ("images", "sparse"):
+            (scene / part).mkdir(parents=True, exist_ok=True)
+        for file in names:
+            (scene / "images" / file).touch()
+        with pytest.raises(RunError, match="as far as this"):
+            map_views(scene, tmp_path / "runs")
+    assert [names for _, _, names in left] == [["first_2.png"], ["second_2.png"], ["second_2.png"]]
+    assert left[0][:2] != left[1][:2] == left[2][:2]
 
 
 def test_overlaps_are_intersections_over_unions():

@@ -25,7 +25,7 @@ from tidefield.synthetic import make_survey, write_survey
 @pytest.fixture(scope="module")
 def flat(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("points") / "flat"
-    write_survey(make_survey("ground_textures", seed=5, views=6, width=320), folder)
+    write_survey(make_survey("ground_textures", seed=5, views=6, width=320, supersample=1), folder)
     return folder
 
 

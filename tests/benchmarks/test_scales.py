@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from scenes_on_disk import PINHOLE, survey, write_colmap
 
 from benchmarks.scales import METRICS, SCALES_FILE, SHOWN, WAYS, scales, write_page
 from tidefield.compare.run import Usage
 from tidefield.errors import RunError
 from tidefield.files import read_json, write_json
-from tidefield.synthetic import make_survey, write_survey
 
 
 def test_every_way_is_measured_once_at_every_width_and_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -56,7 +56,7 @@ def test_every_way_is_measured_once_at_every_width_and_shown(tmp_path: Path, mon
 
 def test_a_detail_shows_the_photograph_beside_both_ways(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    write_survey(make_survey("vegetation", seed=1, views=9, width=64, supersample=1), tmp_path / "flat")
+    write_colmap(tmp_path / "flat", survey(PINHOLE))
     shades, ways = {"points": 100, "cones": 200}, list(WAYS)
 
     def run(command: Sequence[str], environment: Mapping[str, str]) -> Usage:
@@ -64,7 +64,7 @@ def test_a_detail_shows_the_photograph_beside_both_ways(tmp_path: Path, monkeypa
         (made / "renderings").mkdir(parents=True)
         way = next(name for name in ways if all(option in command for option in WAYS[name]))
         grey = np.full((48, 64, 3), shades.get(way, 0), np.uint8)
-        Image.fromarray(grey).save(made / "renderings" / "vegetation_0001.png")
+        Image.fromarray(grey).save(made / "renderings" / "photo.png")
         found = {"mean": dict.fromkeys(METRICS, 1.0), "seconds_per_frame": 0.5, "protocol": "strict"}
         write_json(made / "evaluation.json", {**found, "configuration": {}})
         return Usage(1.0, 1)

@@ -83,7 +83,7 @@ def map_(options: Map, console: Console) -> dict[str, Any]:
     with ExitStack() as stack:
         stack.enter_context(only_writer(options.out))
         opened = stack.enter_context(ExitStack())
-        job, render, about = opened.enter_context(_open(options, console))
+        job, render, about = opened.enter_context(open_job(options, console))
         grid, frame = job.grid, job.grid.frame
         console.print(
             f"{grid.columns} x {grid.rows} cells of {grid.cell:.4g} {frame.unit}, {frame.name}; "
@@ -132,7 +132,7 @@ def _in_blocks(
 
 
 @contextmanager
-def _open(options: Map, console: Console) -> Iterator[tuple[Job, Render, dict[str, Any]]]:
+def open_job(options: Map, console: Console) -> Iterator[tuple[Job, Render, dict[str, Any]]]:
     """What a map is made of, the method while the block lasts, and the record of its source."""
     from shapely import union_all
 
@@ -176,7 +176,7 @@ def _tile_maker(options: Map, key: str) -> Iterator[Callable[[Sequence[int]], It
 
     torch.set_num_threads(1)  # a task has one core
     pull_all(options)
-    with _open(options, make_console(quiet=True)) as (job, render, _):
+    with open_job(options, make_console(quiet=True)) as (job, render, _):
         require_same(options.source, key, job.key)
         maker, tiles = TileMaker(job, render, options.out), job.tiles()
 
