@@ -15,7 +15,7 @@ from fsspec.implementations.memory import MemoryFileSystem
 from tidefield import addresses, cli
 from tidefield.addresses import address_of, copy_of, local_word, pull, push
 from tidefield.commands.common import ZeroShot
-from tidefield.commands.map_ import Map, _open, _tile_maker
+from tidefield.commands.map_ import Map, _tile_maker, open_job
 from tidefield.errors import RunError
 from tidefield.files import LOCK_FILE
 from tidefield.progress import make_console
@@ -331,7 +331,7 @@ def test_a_worker_with_an_empty_cache_copies_the_scene_and_sends_its_tiles(bucke
     shutil.copytree(scene, bucket / "scene")
     options = Map(copy(bucket), copy(bucket, "map"), device="cpu", zero=ZeroShot(zero_shot=True))
     pull(options.source)
-    with _open(options, make_console(quiet=True)) as (job, _, _):
+    with open_job(options, make_console(quiet=True)) as (job, _, _):
         key = job.key
     sent = []
     for _ in range(2):  # two machines, one after the other
