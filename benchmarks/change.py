@@ -299,7 +299,8 @@ def _cover_tables(pairs: list[dict[str, Any]]) -> list[Table]:
         )
     return [
         Table(
-            "Plants of built-in pairs (m²; found and its range; true)",
+            "Plants of built-in pairs (m²; found and its range; true: what plants higher than 3 cm cover, seen from "
+            "above, with the gaps between them closed by a window of 0.4 m)",
             ["pair", "earlier", "later", "gained", "lost"],
             plants,
         ),

@@ -13,18 +13,18 @@ import numpy as np
 import torch
 
 from benchmarks.change import store
-from benchmarks.change_pairs import compared
+from benchmarks.change_pairs import centres, compared, regions_of, require_options
 from benchmarks.maps import made_map
 from benchmarks.records import MEASURED, say
+from tidefield.change.errors import Z95
 from tidefield.change.inputs import open_survey
 from tidefield.change.measure import Change, measure
 from tidefield.change.regions import Region, dilated
 from tidefield.change.surfaces import Grid
-from tidefield.change.write import polygons_of
 from tidefield.data.load import load_scene
 from tidefield.files import completed_folder, write_json
 from tidefield.geometry.geodesy import LocalFrame
-from tidefield.synthetic.flights import BARE, write_flights
+from tidefield.synthetic.flights import BARE_M, write_flights
 from tidefield.synthetic.grids import Extent, Raster
 from tidefield.synthetic.two_dates import Difference, Pair, make_pair
 
@@ -35,7 +35,9 @@ DATES = ("2023-05-01", "2024-05-01")
 _CELL_M = 0.15
 AREA_M = (-8.0, -14.0, 38.0, 14.0)
 """West, south, east and north of what is mapped, in the flat's coordinates: a bank, the bar, and ground that stays."""
-_LAYERS = ("bed", "surface", "marsh")
+_LAYERS = ("bed", "surface", "seen")
+_NODES_M = 0.05
+"""Spacing of the truth's nodes, which shows single blades."""
 
 
 def frame() -> LocalFrame:
@@ -45,12 +47,14 @@ def frame() -> LocalFrame:
 def write_photographs(pair: Pair, folder: Path) -> None:
     """Write both surveys' photographs, positions and control as a pilot has them, and the truth beside them."""
     write_flights(pair, folder, frame(), DATES, SEED)
-    layers = {
-        f"{layer}{k}": getattr(survey.flat, layer).values[0].numpy()
-        for k, survey in enumerate((pair.earlier, pair.later))
-        for layer in _LAYERS
-    }
-    extent = pair.ground_change.extent
+    west, south, east, north = AREA_M
+    # The outermost cells of a map may lie partly beyond the area.
+    extent = Extent.around([west - 1, south - 1], [east + 1, north + 1], _NODES_M)
+    layers, nodes = {}, extent.nodes()
+    for k, flat in enumerate((pair.earlier.flat, pair.later.flat)):
+        ground = torch.cat([flat.bed.sample(nodes), flat.surface.sample(nodes)]).reshape(2, extent.rows, extent.columns)
+        values = torch.cat([ground, flat.seen(extent).values]).numpy()
+        layers |= {f"{layer}{k}": value for layer, value in zip(_LAYERS, values, strict=True)}
     with (folder / "truth.npz").open("wb") as file:
         np.savez(
             file,
@@ -63,12 +67,10 @@ def write_photographs(pair: Pair, folder: Path) -> None:
 
 
 class Truth:
-    """What is true of the flat at the cells of a grid, row 0 in the north."""
+    """What is true of the flat at the cells of a grid, row 0 in the north: heights of bed, water and what is seen."""
 
     def __init__(self, file: Path, grid: Grid) -> None:
-        x = grid.west_m + (np.arange(grid.columns) + 0.5) * grid.cell_m
-        y = grid.north_m - (np.arange(grid.rows) + 0.5) * grid.cell_m
-        east, north = (axis.ravel() for axis in np.meshgrid(x, y))
+        east, north = centres(grid)
         world = frame().from_crs(np.column_stack([east, north, np.zeros(len(east))]))
         xy = torch.from_numpy(world[:, :2].T.copy()).float()
         with np.load(file, allow_pickle=False) as values:
@@ -81,9 +83,10 @@ class Truth:
 
     def bare(self, *dates: int) -> np.ndarray:
         """Ground that is neither under water nor under plants at these dates."""
-        return np.logical_and.reduce(
-            [(self.of[f"surface{k}"] - self.of[f"bed{k}"] < 1e-3) & (self.of[f"marsh{k}"] < BARE) for k in dates]
+        water, plants = (
+            np.max([self.of[f"{layer}{k}"] - self.of[f"bed{k}"] for k in dates], axis=0) for layer in _LAYERS[1:]
         )
+        return (water < 1e-3) & (plants < BARE_M)
 
     @property
     def change(self) -> np.ndarray:
@@ -94,22 +97,28 @@ def change_chain(work: Path, views: int = 16, width: int = 800, runs: Path = MEA
     """Make the photographs, prepare and map both surveys, compare them, and compare each step with the truth.
 
     Args:
-        work: Folder for photographs, scenes and maps; what is there is not made again.
+        work: Folder for photographs, scenes and maps of these options; what is there is not made again.
         views: Photographs of each survey.
         width: Of the photographs in pixels.
         runs: Store the figures in this folder's change.json.
+
+    Raises:
+        RunError: the work folder holds files of other options.
     """
     from rich.console import Console
 
     from tidefield.commands.prepare import Prepare, prepare
 
+    options = {"photographs": views, "width_px": width, "change_m": CHANGE_M}
+    made_of = {"category": CATEGORY, "seed": SEED, "area_m": list(AREA_M), "cell_m": _CELL_M}
+    require_options(work, {**options, **made_of})
     surveys = work / "surveys"
     if not surveys.exists():
         say(f"photographs: {views} of {width} px at each date")
         pair = make_pair(CATEGORY, SEED, Difference(change_m=CHANGE_M), views=views, width=width)
         with completed_folder(surveys) as partial:
             write_photographs(pair, partial)
-    record: dict[str, Any] = {"photographs": views, "width_px": width, "change_m": CHANGE_M, "steps": {}}
+    record: dict[str, Any] = {**options, "steps": {}}
     for k, date in enumerate(DATES):
         photographs, scene, out = surveys / date / "photographs", work / f"scene-{date}", work / f"map-{date}"
         if not (scene / "report.html").exists():
@@ -176,23 +185,19 @@ def _heights(out: Path, surveys: Path, k: int) -> dict[str, float]:
         "cells": int(some.sum()),
         "median_m": middle,
         "nmad_m": float(1.4826 * np.median(np.abs(error[some] - middle))),
-        "within_95": float((np.abs(error) < 1.96 * sigma)[some].mean()),
+        "within_95": float((np.abs(error) < Z95 * sigma)[some].mean()),
     }
 
 
 def _bare(surveys: Path, grid: Grid) -> list[Region]:
-    return _regions(Truth(surveys / "truth.npz", grid).bare(0, 1), grid)
+    return regions_of(Truth(surveys / "truth.npz", grid).bare(0, 1), grid)
 
 
 def _stable(surveys: Path, grid: Grid) -> list[Region]:
     """Bare ground well away from what changed."""
     truth = Truth(surveys / "truth.npz", grid)
     same = truth.bare(0, 1) & ~dilated(np.abs(truth.change) > 1e-6, 8)
-    return _regions(same, grid)
-
-
-def _regions(cells: np.ndarray, grid: Grid) -> list[Region]:
-    return [Region("ground", polygon) for _, polygon in polygons_of(cells.astype(np.uint8), grid, cells)]
+    return regions_of(same, grid)
 
 
 def _against_truth(change: Change, surveys: Path) -> dict[str, Any]:

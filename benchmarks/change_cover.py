@@ -11,15 +11,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from benchmarks.change import store
 from benchmarks.change_pairs import stable_frame, write_surface
 from benchmarks.records import MEASURED, say
-from tidefield.change.cover import compare_cover
+from tidefield.change.cover import WINDOW_M, compare_cover
 from tidefield.change.measure import Options, measure
 from tidefield.change.surfaces import Grid, open_surface
 from tidefield.change.water import measure_water
+from tidefield.synthetic.flat import TidalFlat
+from tidefield.synthetic.flights import BARE_M
 from tidefield.synthetic.grids import Extent, Raster
 from tidefield.synthetic.settings import settings_for
 from tidefield.synthetic.survey import Survey
@@ -30,8 +33,6 @@ FIRST_SEED = 200
 """The rules of cover were chosen on pairs 5 to 8, 100 to 102, 300 and 301."""
 HALF_M = (30.0, 25.0)
 CELL_M = 0.15
-COVERED = 0.25
-"""Density of the marsh from which ground counts as covered."""
 NOISE = 3.0
 GAINS = 0.15
 """Deviation of the log gains of the later orthophoto's channels."""
@@ -63,12 +64,12 @@ def _pair(category: str, seed: int) -> dict[str, Any]:
     shape = (extent.rows, extent.columns)
     random = np.random.default_rng([seed, 20295])
     gains = np.exp(random.normal(0, GAINS, 3))
-    pictures, marsh, wet, paths = [], [], [], []
+    pictures, plants, wet, paths = [], [], [], []
     with tempfile.TemporaryDirectory() as folder:
         for k, survey in enumerate((pair.earlier, pair.later)):
             colour = survey.flat.map(extent)[0].numpy() * 255 * (gains if k else 1)
             pictures.append((colour + random.normal(0, NOISE, colour.shape)).clip(0, 255).astype(np.uint8))
-            marsh.append(_on(survey.flat.marsh, extent) > COVERED)
+            plants.append(covered(survey.flat, extent))
             wet.append(_under(survey, extent, levels[k]))
             heights = surveyed(survey.flat.surface, extent, random, ERRORS)
             paths.append(write_surface(Path(folder) / f"{k}.tif", heights, extent))
@@ -80,7 +81,8 @@ def _pair(category: str, seed: int) -> dict[str, Any]:
     cover = compare_cover(pictures[0], pictures[1], np.ones(shape, bool), grid)
     assert line is not None
     area = cover.areas["all"]
-    true = {"earlier": marsh[0], "later": marsh[1], "gained": marsh[1] & ~marsh[0], "lost": marsh[0] & ~marsh[1]}
+    before, after = plants
+    true = {"earlier": before, "later": after, "gained": after & ~before, "lost": before & ~after}
     dried, drowned = wet[0] & ~wet[1], wet[1] & ~wet[0]
     return {
         "area_m2": cover.known_m2,
@@ -96,6 +98,14 @@ def _pair(category: str, seed: int) -> dict[str, Any]:
             "move_m": list(line.move_m),
         },
     }
+
+
+def covered(flat: TidalFlat, extent: Extent) -> np.ndarray:
+    """Cells, row 0 in the north, that drawn plants cover seen straight down, closed as the product averages colours."""
+    plants = _on(flat.seen(extent), extent) - _on(flat.surface, extent) > BARE_M
+    reach = round(WINDOW_M / extent.cell_m)
+    window = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+    return cv2.morphologyEx(plants.astype(np.uint8), cv2.MORPH_CLOSE, window).astype(bool)
 
 
 def _on(raster: Raster, extent: Extent) -> np.ndarray:

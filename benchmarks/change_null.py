@@ -16,6 +16,7 @@ import numpy as np
 import shapely
 
 from benchmarks.change import store
+from benchmarks.change_pairs import regions_of, require_options
 from benchmarks.maps import made_map
 from benchmarks.records import MEASURED, say
 from tidefield.change.errors import Z95
@@ -25,7 +26,6 @@ from tidefield.change.measure import Options, measure
 from tidefield.change.regions import Region, dilated, rasterised
 from tidefield.change.shift import picture_grid, read_picture
 from tidefield.change.surfaces import Grid, Surface, common_grid
-from tidefield.change.write import polygons_of
 from tidefield.files import completed_folder, write_text
 from tidefield.maps.smoothing import smoothed
 
@@ -59,13 +59,18 @@ def change_null(photographs: Path, work: Path, runs: Path = MEASURED) -> None:
 
     Args:
         photographs: Folder with swindale's photographs, gps.csv and gcp_list.txt.
-        work: Folder for scenes and maps; what is there is not made again.
+        work: Folder for scenes and maps of these photographs; what is there is not made again.
         runs: Store the figures in this folder's change.json.
+
+    Raises:
+        RunError: the work folder holds files of other photographs or options.
     """
     from rich.console import Console
 
     from tidefield.commands.prepare import Prepare, prepare
 
+    flights = {name: list(flight) for name, flight in FLIGHTS.items()}
+    require_options(work, {"photographs": str(photographs.resolve()), "flights": flights, "cell_m": CELL_M})
     record: dict[str, Any] = {}
     for name, flight in FLIGHTS.items():
         own = work / name
@@ -146,5 +151,4 @@ def dry_ground(earlier: Surface, later: Surface, grid: Grid) -> np.ndarray:
 
 
 def _regions(cells: np.ndarray, grid: Grid) -> list[Region]:
-    polygons = [polygon for _, polygon in polygons_of(cells.astype(np.uint8), grid, cells)]
-    return [Region("ground", polygon) for polygon in polygons if shapely.area(polygon) > grid.cell_area_m2]
+    return [region for region in regions_of(cells, grid) if shapely.area(region.geometry) > grid.cell_area_m2]

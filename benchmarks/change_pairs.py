@@ -12,11 +12,14 @@ import numpy as np
 import torch
 
 from benchmarks.records import say
+from tidefield.change.errors import Z95
 from tidefield.change.measure import Change, measure
 from tidefield.change.regions import Region, dilated
 from tidefield.change.surfaces import Grid, open_surface
 from tidefield.change.volumes import Volume
 from tidefield.change.write import polygons_of
+from tidefield.errors import RunError
+from tidefield.files import read_json, write_json
 from tidefield.synthetic.grids import Extent, Raster
 from tidefield.synthetic.two_dates import ground_pair, surveyed
 
@@ -62,7 +65,12 @@ def stable_frame(earlier: Raster, later: Raster, grid: Grid) -> list[Region]:
     same &= ~dilated(~same, 8)
     rows, columns = grid.rows // 6, grid.columns // 6
     same[rows:-rows, columns:-columns] = False
-    return [Region("frame", polygon) for _, polygon in polygons_of(same.astype(np.uint8), grid, same)]
+    return regions_of(same, grid)
+
+
+def regions_of(cells: np.ndarray, grid: Grid) -> list[Region]:
+    """Cells as polygons."""
+    return [Region("ground", polygon) for _, polygon in polygons_of(cells.astype(np.uint8), grid, cells)]
 
 
 def compared(change: Change, truth: np.ndarray, grid: Grid, full: float | None = None) -> dict[str, Any]:
@@ -76,7 +84,7 @@ def compared(change: Change, truth: np.ndarray, grid: Grid, full: float | None =
     known = np.isfinite(change.dz)
     unchanged = known & (np.abs(truth) < 1e-4)
     sigma = np.concatenate([change.errors.cell_sigma(rows) for rows in grid.strips()])
-    significant = np.abs(change.dz) > 1.959964 * sigma
+    significant = np.abs(change.dz) > Z95 * sigma
     record: dict[str, Any] = {
         "false_alarms": float(significant[unchanged].mean()),
         "detection_m": change.detection_m[1],
@@ -114,13 +122,35 @@ def _beside(volume: Volume, whole_m3: float, inside_m3: float) -> dict[str, floa
     }
 
 
-def true_change(earlier: Raster, later: Raster, grid: Grid) -> np.ndarray:
-    """The truth at the centres of a grid's cells, row 0 in the north."""
+def centres(grid: Grid) -> np.ndarray:
+    """East and north [2 N] of the centres of a grid's cells, row by row from the north."""
     x = grid.west_m + (np.arange(grid.columns) + 0.5) * grid.cell_m
     y = grid.north_m - (np.arange(grid.rows) + 0.5) * grid.cell_m
-    xy = torch.from_numpy(np.stack([axis.ravel() for axis in np.meshgrid(x, y)]).astype(np.float32))
+    return np.stack([axis.ravel() for axis in np.meshgrid(x, y)])
+
+
+def true_change(earlier: Raster, later: Raster, grid: Grid) -> np.ndarray:
+    """The truth at the centres of a grid's cells, row 0 in the north."""
+    xy = torch.from_numpy(centres(grid)).float()
     both = [raster.sample(xy)[0].numpy().reshape(grid.shape) for raster in (earlier, later)]
     return both[1] - both[0]
+
+
+def require_options(work: Path, options: dict[str, Any]) -> None:
+    """Check that what a work folder holds is of these options, and keep them in one without files.
+
+    Raises:
+        RunError: it is of other ones, or of a version that did not keep them.
+    """
+    path = work / "options.json"
+    kept = read_json(path)
+    if not any(other.is_file() for other in work.rglob("*") if other != path):
+        write_json(path, options)
+    elif kept != options:
+        raise RunError(
+            f"{work} holds files of {'unknown options' if kept is None else kept}: expected a new folder, or one of "
+            f"{options}; delete it, or name another with --work"
+        )
 
 
 def write_surface(path: Path, heights: np.ndarray, extent: Extent) -> Path:

@@ -90,28 +90,145 @@ def test_a_flight_is_copied_with_its_own_lines_of_the_lists(tmp_path):
     assert (tmp_path / "out" / "gcp_list.txt").read_text().splitlines() == lines[:2]
 
 
-def test_photographs_of_the_chain_come_with_control_that_fits_them(tmp_path, monkeypatch):
+@pytest.fixture(scope="module")
+def pair():
+    from tidefield.synthetic.two_dates import Difference, make_pair
+
+    return make_pair("tidal_trees", 3, Difference(0.2), views=9, width=48, supersample=1)
+
+
+@pytest.fixture(scope="module")
+def chain(pair, tmp_path_factory):
+    """Photographs and truth as `change_chain` writes them."""
+    from benchmarks.change_chain import write_photographs
+    from tidefield.synthetic import flights
+
+    folder = tmp_path_factory.mktemp("chain")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(flights, "CONTROL_POINTS", 4)
+        write_photographs(pair, folder)
+    return folder
+
+
+def test_photographs_of_the_chain_come_with_control_that_fits_them(pair, chain):
     import torch
 
     from benchmarks import change_chain
     from tidefield.change.surfaces import Grid
     from tidefield.survey.io.photographs import read_survey
-    from tidefield.synthetic import flights
-    from tidefield.synthetic.two_dates import Difference, make_pair
 
-    monkeypatch.setattr(flights, "CONTROL_POINTS", 4)
-    pair = make_pair("ground_textures", 3, Difference(0.2), views=9, width=96)
-    change_chain.write_photographs(pair, tmp_path)
-    survey = read_survey(tmp_path / change_chain.DATES[1] / "photographs", None, None)
-    assert len(survey.photographs) == 9
-    assert survey.control is not None
+    frame = change_chain.frame()
+    for made, date in zip((pair.earlier, pair.later), change_chain.DATES, strict=True):
+        survey = read_survey(chain / date / "photographs", None, None)
+        assert len(survey.photographs) == 9
+        control = survey.control
+        assert control is not None
+        assert len(control.points) == 4
+        names = [photograph.name for photograph in survey.photographs]
+        points = frame.from_crs(np.array([control.points[mark.point] for mark in control.marks]))
+        uv, _ = made.cameras.project(torch.from_numpy(points).float())
+        which = [names.index(mark.photograph) for mark in control.marks]
+        error = uv[which, range(len(which))].numpy() - [mark.uv_px for mark in control.marks]
+        assert len(error) > 12
+        assert 0.15 < error.std() < 0.6  # marks are set to 0.3 pixels
+        assert np.abs(error.mean(axis=0)).max() < 0.3
+        stated = [photograph.position for photograph in survey.photographs]
+        places = [[at.longitude_deg, at.latitude_deg, at.height_m] for at in stated if at is not None]
+        off = frame.from_geographic(np.array(places)) - made.cameras.position_world.double().numpy()
+        assert 0.8 < off.std() < 2.5  # a receiver's 1.5 m
     grid = Grid(None, 499_990.0, 5_800_010.0, 0.5, 40, 40)
-    truth = change_chain.Truth(tmp_path / "truth.npz", grid)
+    truth = change_chain.Truth(chain / "truth.npz", grid)
     # The middle cell lies a quarter of a metre beside the origin of the flat.
     xy = torch.tensor([[0.25], [-0.25]])
     assert truth.of["bed1"][20, 20] == pytest.approx(float(pair.later.flat.bed.sample(xy)[0]), abs=0.02)
     assert truth.change[20, 20] == pytest.approx(float(pair.ground_change.sample(xy)[0]), abs=0.02)
     assert truth.bare(0, 1).dtype == bool
+
+
+def test_control_stands_under_no_plant_wherever_the_marsh_is(pair, monkeypatch):
+    from dataclasses import replace
+
+    import torch
+
+    from tidefield.synthetic import flights
+    from tidefield.synthetic.grids import Extent
+
+    monkeypatch.setattr(flights, "CONTROL_POINTS", 4)
+    first = flights._control(pair, 11)[0, :2]
+    # The highest leaf comes to lie over the first place, and all others are moved with it.
+    flat = pair.later.flat
+    leaves = flat.plants.leaves
+    move = torch.from_numpy(first).float()[:, None] - leaves.centre[:2, [int(leaves.centre[2].argmax())]]
+    moved = replace(leaves, centre=torch.cat([leaves.centre[:2] + move, leaves.centre[2:]]))
+    flat = replace(flat, plants=replace(flat.plants, leaves=moved))
+    places = flights._control(replace(pair, later=replace(pair.later, flat=flat)), 11)[:, :2]
+    assert np.hypot(*(places - first).T).min() > 0.1
+    for x, y in places.tolist():
+        around = Extent(x - 0.1, y - 0.1, 5, 5, 0.05)
+        above = flat.seen(around).values.reshape(-1) - flat.bed.sample(around.nodes())[0]
+        assert float(above.max()) < flights.BARE_M
+
+
+def test_bare_ground_of_the_chain_has_no_plants_on_it(pair, chain):
+    from benchmarks import change_chain
+    from tidefield.change.surfaces import Grid
+    from tidefield.synthetic.flights import BARE_M
+    from tidefield.synthetic.grids import Extent
+
+    west, south, east, north = change_chain.AREA_M
+    cells = Extent.around([west, south], [east, north], 0.15)
+    corner = (5e5 + west - 0.075, 5.8e6 + cells.north_m + 0.075)
+    bare = change_chain.Truth(chain / "truth.npz", Grid(None, *corner, 0.15, cells.columns, cells.rows)).bare(0, 1)
+    assert bare.mean() > 0.3
+    for flat in (pair.earlier.flat, pair.later.flat):
+        bed = flat.bed.sample(cells.nodes())[0].reshape(cells.rows, cells.columns)
+        above = (flat.seen(cells).values[0] - bed).flip(0).numpy()
+        assert above[bare].max() < BARE_M
+        # Plants that grow outside the marsh are none of it.
+        marsh = flat.marsh.sample(cells.nodes())[0].reshape(cells.rows, cells.columns).flip(0).numpy()
+        assert ((above > 0.5) & (marsh < 0.02)).sum() > 20
+
+
+def test_plants_outside_the_marsh_are_true_cover(pair):
+    from benchmarks.change_cover import covered
+    from tidefield.synthetic.grids import Extent
+
+    flat = pair.earlier.flat
+    extent = Extent.around([-30.0, -25.0], [30.0, 25.0], 0.15)
+    tall = flat.seen(extent).values - flat.surface.sample(extent.nodes()).reshape(1, extent.rows, extent.columns) > 1.2
+    marsh = flat.marsh.sample(extent.nodes()).reshape(tall.shape)
+    trees = (tall & (marsh < 0.02))[0].flip(0).numpy()
+    assert trees.sum() * 0.15**2 > 5
+    assert covered(flat, extent)[trees].all()
+
+
+def test_a_work_folder_of_other_options_is_refused(tmp_path, monkeypatch):
+    from benchmarks import change_chain, change_null
+    from tidefield.errors import RunError, SurveyError
+
+    def stop(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(change_chain, "make_pair", stop)
+    for width in (800, 48):  # before anything was made, options may change
+        with pytest.raises(KeyboardInterrupt):
+            change_chain.change_chain(tmp_path / "chain", 9, width, tmp_path)
+    (tmp_path / "chain" / "surveys").mkdir()
+    (tmp_path / "chain" / "surveys" / "truth.npz").touch()
+    with pytest.raises(SurveyError, match="photographs is nothing"):  # the same options go on with what is there
+        change_chain.change_chain(tmp_path / "chain", 9, 48, tmp_path)
+    with pytest.raises(RunError, match=r"chain holds files of .*'width_px': 48.*: expected .*'width_px': 800"):
+        change_chain.change_chain(tmp_path / "chain", 9, 800, tmp_path)
+    (tmp_path / "former").mkdir()
+    (tmp_path / "former" / "truth.npz").touch()
+    with pytest.raises(RunError, match="former holds files of unknown options"):
+        change_chain.change_chain(tmp_path / "former", 9, 48, tmp_path)
+    monkeypatch.setattr(change_null, "copy_flight", stop)
+    with pytest.raises(KeyboardInterrupt):
+        change_null.change_null(tmp_path / "swindale", tmp_path / "null", tmp_path)
+    (tmp_path / "null" / "IMG_1414.jpg").touch()
+    with pytest.raises(RunError, match=r"null holds files of .*swindale"):
+        change_null.change_null(tmp_path / "another", tmp_path / "null", tmp_path)
 
 
 def test_parts_that_were_measured_are_on_the_page(tmp_path):

@@ -32,7 +32,9 @@ from tidefield.synthetic.two_dates import Difference, Pair, SurveyErrors, make_p
 
 @pytest.fixture(scope="module")
 def pair() -> Pair:
-    return make_pair("ground_textures", 9, Difference(change_m=0.4, marsh_growth=1.0, tide_m=0.0), views=6, width=160)
+    return make_pair(
+        "ground_textures", 9, Difference(change_m=0.4, marsh_growth=1.0, tide_m=0.0), 6, 160, supersample=1
+    )
 
 
 @pytest.fixture(scope="module")

@@ -86,6 +86,27 @@ def test_plant_depths_match_brute_force() -> None:
         assert torch.equal(number >= 0, torch.isfinite(depth))
 
 
+def test_stems_far_below_are_as_in_double_precision() -> None:
+    """Prop roots of a mangrove, 120 m below the camera."""
+    random = np.random.default_rng(0)
+    count, radius = 20_000, 0.035
+    turn = random.uniform(0, 2 * math.pi, count)
+    start = np.stack([*random.uniform(-20, 20, (2, count)), random.uniform(0, 1, count)])
+    end = start + np.stack([0.5 * np.cos(turn), 0.5 * np.sin(turn), np.full(count, 0.3)])
+    across = np.stack([-np.sin(turn), np.cos(turn), np.zeros(count)])
+    aim = 0.5 * (start + end) + across * random.uniform(-3 * radius, 3 * radius, count)
+    eye = np.array([[0.0], [0.0], [120.0]])
+    depths = []
+    for kind in (np.float32, np.float64):
+        a, b, origin, to = (torch.from_numpy(x.astype(kind)) for x in (start, end, eye, (aim - eye) / 120))
+        stems = Stems(a, b, torch.full_like(a[0], radius), torch.zeros_like(a))
+        depths.append(stems.depth(torch.arange(count), (origin, to)).double())
+    hit = torch.isfinite(torch.stack(depths))
+    assert 0.2 < hit[1].double().mean() < 0.8
+    assert (hit[0] != hit[1]).double().mean() < 0.005
+    assert (depths[0] - depths[1])[hit.all(0)].abs().max() < 1e-3
+
+
 def test_height_field_depths_match_small_steps() -> None:
     raster = bumpy_surface()
     for tilt in (0.0, 0.9):

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,9 +11,12 @@ import torch
 from tidefield.errors import SceneError
 from tidefield.geometry.cameras import Cameras, pixel_grid
 from tidefield.synthetic import CATEGORIES, Flight, Survey, make_survey
+from tidefield.synthetic.flat import TidalFlat
 from tidefield.synthetic.grids import Extent
+from tidefield.synthetic.large import PHOTOGRAPHS, LargeFlight, make_large_flight, planned_flight
 from tidefield.synthetic.rays import Pinhole
 from tidefield.synthetic.survey import _near_far
+from tidefield.synthetic.two_dates import Difference, make_pair
 
 
 @cache
@@ -159,7 +163,7 @@ def test_every_category_has_overlap_contrast_and_sparse_points(category: str) ->
 def test_categories_differ_as_their_names_say() -> None:
     water, plants = {}, {}
     for category in CATEGORIES:
-        flat = survey(category).flat
+        flat = make_survey(category, seed=4, views=2, width=16, supersample=1).flat
         water[category] = float((flat.ground.sample(flat.surface.extent.nodes()).water_depth_m > 0.02).float().mean())
         plants[category] = len(flat.plants.leaves) / flat.surface.extent.columns / flat.surface.extent.rows
     assert max(water, key=lambda c: water[c]) == "deep_water"
@@ -228,6 +232,48 @@ def test_flight_options_reach_the_flat_and_the_poses() -> None:
     assert tilt_deg.min() > 18
     assert tilt_deg.max() < 52
     assert torch.equal(survey().cameras.forward_world[:, 2] < -0.98, torch.ones(30, dtype=torch.bool))
+
+
+def test_flight_options_reach_large_flights() -> None:
+    def flat(**options: float) -> TidalFlat:
+        flight = Flight(altitude_m=20.0, **options)  # type: ignore[arg-type]
+        return planned_flight(LargeFlight("ground_textures", 4, strips=1, each=2, width=16, flight=flight))[3]()
+
+    wet, dry = flat(sun_elevation_deg=12.0, wetness=1.0), flat(wetness=0.0)
+    assert float(wet.light.sun[2]) == pytest.approx(np.sin(np.radians(12.0)))
+    assert wet.ground.maps.values[5].mean() > dry.ground.maps.values[5].mean() + 0.2
+
+
+def test_water_moves_between_the_photographs_of_large_flights(tmp_path: Path) -> None:
+    made = []
+    for motion in (0.0, 1.5):
+        flight = Flight(altitude_m=20.0, water_motion=motion)
+        plan = LargeFlight("deep_water", 4, strips=1, each=2, width=64, flight=flight)
+        make_large_flight(plan, tmp_path / str(motion))
+        made.append([file.read_bytes() for file in sorted((tmp_path / str(motion) / PHOTOGRAPHS).iterdir())])
+    assert made[0][0] == made[1][0]
+    assert made[0][1] != made[1][1]
+
+
+def test_flight_options_reach_both_dates_of_a_pair() -> None:
+    flights = (
+        Flight(altitude_m=20.0, sun_elevation_deg=12.0, wetness=0.0),
+        Flight(altitude_m=20.0, sun_elevation_deg=50.0, wetness=1.0, water_motion=1.5),
+    )
+    same = Difference(change_m=0.0, marsh_growth=1.0, tide_m=0.0)
+    made = [
+        make_pair("ground_textures", 4, same, views=2, width=32, flights=of, supersample=1)
+        for of in (flights, (flights[0], Flight(altitude_m=20.0)))
+    ]
+    elevations = [float(survey.flat.light.sun[2]) for pair in made for survey in (pair.earlier, pair.later)]
+    assert elevations == pytest.approx(np.sin(np.radians([12.0, 50.0, 12.0, 12.0])))
+    dry, wet = (survey.flat.ground.maps.values[5].mean() for survey in (made[0].earlier, made[0].later))
+    assert wet > dry + 0.2
+    later = made[0].later
+    still, moved = (later.flat.photograph(later.cameras[1], 1, seconds)[0] for seconds in (0.0, 1.5))
+    shown = later.photographs[1].float() / 255
+    assert (shown - moved).abs().max() < 0.51 / 255
+    assert (shown - still).abs().max() > 0.51 / 255
 
 
 def test_plants_cast_shadows() -> None:

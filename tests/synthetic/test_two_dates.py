@@ -11,7 +11,12 @@ from PIL import Image
 from tidefield.geometry.geodesy import LocalFrame
 from tidefield.synthetic.flights import write_flights
 from tidefield.synthetic.grids import Extent, Raster
-from tidefield.synthetic.two_dates import Difference, SurveyErrors, ground_pair, make_pair, surveyed
+from tidefield.synthetic.two_dates import Difference, Pair, SurveyErrors, ground_pair, make_pair, surveyed
+
+
+@pytest.fixture(scope="module")
+def pair() -> Pair:
+    return make_pair("river_mouths", 3, Difference(change_m=0.3, tide_m=0.0), views=4, width=64, supersample=1)
 
 
 def test_the_creek_cuts_and_fills_and_the_bar_grows_by_what_was_asked_for():
@@ -43,24 +48,53 @@ def test_surveys_have_the_errors_that_were_asked_for():
     assert np.corrcoef(found[:-1].ravel(), found[1:].ravel())[0, 1] > 0.95
 
 
-def test_photographs_of_both_dates_show_the_flat_that_changed():
-    difference = Difference(change_m=0.3, tide_m=0.0)
-    pair = make_pair("river_mouths", 3, difference, views=2, width=48, supersample=1)
+def test_photographs_of_both_dates_show_the_flat_that_changed(pair: Pair):
     change = pair.ground_change.values
     assert float(change.abs().max()) > 0.25
     same = pair.earlier.flat.bed.values + change
     assert torch.allclose(same, pair.later.flat.bed.values)
     assert pair.plants[1].values.mean() > pair.plants[0].values.mean()
-    assert pair.earlier.photographs.shape == (2, 36, 48, 3)
+    assert pair.earlier.photographs.shape == (4, 48, 64, 3)
     assert float(pair.later.cameras.position_world[:, 2].mean()) > float(
         pair.earlier.cameras.position_world[:, 2].mean()
     )
 
 
-def test_flights_can_be_written_where_opencv_cannot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_only_what_changed_differs_between_the_dates():
+    difference = Difference(change_m=0.0, marsh_growth=1.2, tide_m=0.0)
+    pair = make_pair("tidal_trees", 200, difference, views=2, width=32, supersample=1)
+    flats = pair.earlier.flat, pair.later.flat
+    for kind, names in (("leaves", ("centre", "u", "v", "albedo")), ("stems", ("start", "end", "albedo"))):
+        earlier, later = (
+            set(map(tuple, torch.cat([getattr(getattr(flat.plants, kind), name) for name in names]).T.tolist()))
+            for flat in flats
+        )
+        assert earlier < later
+    maps = torch.stack([flat.ground.maps.values for flat in flats])
+    bare = (maps[:, 6] == 0).all(0) & (pair.plants[1].values[0] == 0)
+    assert bare.float().mean() > 0.3
+    albedo_wetness_silt_ripple = maps[:, [2, 3, 4, 5, 7, 9]]
+    assert torch.equal(albedo_wetness_silt_ripple[0, :, bare], albedo_wetness_silt_ripple[1, :, bare])
+    assert flats[0].ground.ripple_heading == flats[1].ground.ripple_heading
+    assert torch.equal(flats[0].ground.noise.table, flats[1].ground.noise.table)
+    assert torch.equal(flats[0].light.noise.table, flats[1].light.noise.table)
+
+
+def test_plants_stand_on_the_ground_of_their_date():
+    """A bar of 1 m lifts the tufts on it by as much."""
+    pair = make_pair("vegetation", 3, Difference(1.0, marsh_growth=1.0, tide_m=0.0), views=2, width=32, supersample=1)
+    above = []
+    for flat in (pair.earlier.flat, pair.later.flat):
+        leaves = flat.plants.leaves
+        risen = pair.ground_change.sample(leaves.centre[:2])[0] > 0.99
+        above.append((leaves.centre[2] - flat.bed.sample(leaves.centre[:2])[0])[risen])
+    assert min(map(len, above)) > 300
+    assert float(above[0].median()) == pytest.approx(float(above[1].median()), abs=0.05)
+
+
+def test_flights_can_be_written_where_opencv_cannot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pair: Pair):
     """Its `imwrite` takes no other names than ASCII on Windows."""
     monkeypatch.setattr(cv2, "imwrite", lambda *_: False)
-    pair = make_pair("river_mouths", 3, Difference(change_m=0.3, tide_m=0.0), views=4, width=64, supersample=1)
     dates = ("2023-05-01", "2024-05-01")
     write_flights(pair, tmp_path / "Süßwasserwatt", LocalFrame.at("EPSG:32631", (5e5, 5.8e6, 0.0)), dates, 11)
     for k, survey in enumerate((pair.earlier, pair.later)):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import copy
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -83,12 +84,16 @@ class TidalFlat:
         edge = 0.5 * (extent.cell_m - cell)
         columns, rows = extent.columns * _MAP_SUPERSAMPLE, extent.rows * _MAP_SUPERSAMPLE
         fine = Extent(extent.west_m - edge, extent.south_m - edge, columns, rows, cell)
+        fine_view = Parallel.straight_down(fine, self.highest_m + 1)
+        tasks = [partial(self._radiance, fine_view, diffuse=True), lambda: self.seen(extent).values[0].flip(0)]
+        radiance, height = in_parallel(tasks, "cpu")
+        return to_srgb(_averaged(radiance, fine_view, _MAP_SUPERSAMPLE)), height
+
+    def seen(self, extent: Extent) -> Raster:
+        """Find the height, metres, of what is seen straight down at an extent's nodes, plants and water included."""
         top = self.highest_m + 1
-        view, fine_view = (Parallel.straight_down(e, top) for e in (extent, fine))
-        tasks = [partial(self._radiance, fine_view, diffuse=True), partial(self.depth, view)]
-        radiance, depth = in_parallel(tasks, "cpu")
-        colour = to_srgb(_averaged(radiance, fine_view, _MAP_SUPERSAMPLE))
-        return colour, top - depth.reshape(extent.rows, extent.columns)
+        depth = self.depth(Parallel.straight_down(extent, top))
+        return Raster(extent, (top - depth.reshape(1, extent.rows, extent.columns)).flip(1))
 
     def depth(self, view: View) -> Float[Tensor, " R"]:
         """Compute the depth of the first surface along every ray of a view; inf where there is none."""
@@ -126,27 +131,61 @@ def _averaged(radiance: Float[Tensor, "3 R"], view: View, split: int) -> Float[T
     return blocks.mean(dim=(2, 4)).permute(1, 2, 0)
 
 
-def make_flat(
-    settings: Settings,
-    extent: Extent,
-    sun_elevation_deg: float,
-    sun_azimuth_deg: float,
-    random: np.random.Generator,
-    change: Callable[[Terrain], Terrain] | None = None,
+@dataclass(frozen=True)
+class Date:
+    """What a flat is like at one date.
+
+    Attributes:
+        sun_azimuth_deg: clockwise from north.
+        change: made to the ground before plants grow.
+    """
+
+    settings: Settings
+    sun_elevation_deg: float
+    sun_azimuth_deg: float
+    change: Callable[[Terrain], Terrain] | None = None
+
+
+def make_flat(date: Date, extent: Extent, random: np.random.Generator) -> TidalFlat:
+    """Build a flat over an extent."""
+    [flat] = make_flats([date], extent, random)
+    return flat
+
+
+def make_flats(dates: Sequence[Date], extent: Extent, random: np.random.Generator) -> list[TidalFlat]:
+    """Build one flat over an extent at several dates: all that is drawn is the same, and only the dates differ.
+
+    As many plants as the settings of the first date want compete for places; those of each date stand where its
+    ground and marsh let them.
+    """
+    sites = []
+    for date, own in zip(dates, _in_one_state(random, len(dates)), strict=True):
+        terrain = make_terrain(date.settings, extent, own)
+        if date.change is not None:
+            terrain = date.change(terrain)
+        sites.append((terrain, marsh_map(date.settings, terrain, own)))
+    plants = grow(dates[0].settings, sites, random)
+    randoms = _in_one_state(random, len(dates))
+    return [_lit(*parts) for parts in zip(dates, sites, plants, randoms, strict=True)]
+
+
+def _in_one_state(random: np.random.Generator, count: int) -> list[np.random.Generator]:
+    """The generator, which goes on with what it is used for here, and copies of it."""
+    return [random, *(copy.deepcopy(random) for _ in range(count - 1))]
+
+
+def _lit(
+    date: Date, site: tuple[Terrain, Float[Tensor, "H W"]], plants: Plants, random: np.random.Generator
 ) -> TidalFlat:
-    """Build a flat over an extent; `change` is made to its ground before plants grow."""
-    terrain = make_terrain(settings, extent, random)
-    if change is not None:
-        terrain = change(terrain)
-    marsh = marsh_map(settings, terrain, random)
-    plants = grow(settings, terrain, marsh, random)
-    light = Light.make(sun_elevation_deg, sun_azimuth_deg, Noise(random, channels=1))
-    surface = terrain.surface
+    """Cast light and shadows on ground and plants, and make the ground's material."""
+    terrain, marsh = site
+    extent, surface = terrain.extent, terrain.surface
+    light = Light.make(date.sun_elevation_deg, date.sun_azimuth_deg, Noise(random, channels=1))
     low, high = float(surface.values.min()), max(float(surface.values.max()), plants.highest_m)
     from_sun = Parallel.along_sun(extent, low, high, light.sun)
     shadows = Shadows(from_sun, plants.nearest(from_sun)[0])
     points = torch.cat([extent.nodes(), surface.values.reshape(1, -1)])
     shade = blurred(shadows.sunlit(points).reshape(terrain.ground.shape), 1)
-    ground = make_ground(settings, terrain, marsh, light.sun, shade, random)
+    ground = make_ground(date.settings, terrain, marsh, light.sun, shade, random)
     bed, density = Raster(extent, terrain.ground[None]), Raster(extent, marsh[None])
     return TidalFlat(surface, bed, density, ground, plants, light, shadows)

@@ -10,19 +10,21 @@ from pathlib import Path
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float64
 
 from tidefield.errors import SceneError
 from tidefield.files import write_text, writing_to
 from tidefield.geometry.geodesy import LocalFrame
+from tidefield.synthetic.grids import Raster
 from tidefield.synthetic.two_dates import Pair
 from tidefield.synthetic.write import write_picture
 
 CONTROL_POINTS = 8
 CONTROL_M, MARK_PX, GPS_M = 0.01, 0.3, 1.5
 """Deviations of surveyed control, of its marks in photographs, and of the receiver's positions."""
-BARE = 0.02
-"""Density of plants below which ground counts as bare."""
+BARE_M = 0.03
+"""Ground is bare where what is seen straight down is less than this above it."""
 
 
 def write_flights(pair: Pair, folder: Path, frame: LocalFrame, dates: Sequence[str], seed: int) -> None:
@@ -39,6 +41,7 @@ def write_flights(pair: Pair, folder: Path, frame: LocalFrame, dates: Sequence[s
         SceneError: no ground is fit for control.
         RunError: the folder cannot be written to.
     """
+    points = _control(pair, seed)
     for k, (survey, date) in enumerate(zip((pair.earlier, pair.later), dates, strict=True)):
         random = np.random.default_rng([seed, 20290, k])
         photographs = folder / date / "photographs"
@@ -51,7 +54,6 @@ def write_flights(pair: Pair, folder: Path, frame: LocalFrame, dates: Sequence[s
         noisy = frame.to_geographic(position + random.normal(0, GPS_M, position.shape))
         rows = [f"{n},{p[1]:.8f},{p[0]:.8f},{p[2]:.2f}" for n, p in zip(names, noisy, strict=True)]
         write_text(photographs / "gps.csv", "\n".join(["image_name,lat,lon,gps_height", *rows]) + "\n")
-        points = _control(pair, seed)
         points[:, 2] = survey.flat.bed.sample(torch.from_numpy(points[:, :2].T).float())[0].numpy()
         uv, depth = survey.cameras.project(torch.from_numpy(points).float())
         surveyed = frame.to_crs(points + random.normal(0, CONTROL_M, points.shape))
@@ -72,8 +74,12 @@ def _control(pair: Pair, seed: int) -> Float64[np.ndarray, "P 3"]:
     xy = torch.from_numpy(candidates.T).float()
     good = np.abs(pair.ground_change.sample(xy)[0].numpy()) < 1e-6
     for survey in (pair.earlier, pair.later):
-        bed, surface = (raster.sample(xy)[0].numpy() for raster in (survey.flat.bed, survey.flat.surface))
-        good &= (surface - bed < 1e-3) & (survey.flat.marsh.sample(xy)[0].numpy() < BARE)
+        flat = survey.flat
+        # A mark that is next to a plant is hidden by it in some photographs.
+        above = F.max_pool2d(flat.seen(flat.bed.extent).values - flat.bed.values, 3, stride=1, padding=1)
+        clear = Raster(flat.bed.extent, above).sample(xy)[0].numpy() < BARE_M
+        bed, surface = (raster.sample(xy)[0].numpy() for raster in (flat.bed, flat.surface))
+        good &= (surface - bed < 1e-3) & clear
         points = torch.from_numpy(np.column_stack([candidates, bed])).float()
         uv, depth = survey.cameras.project(points)
         size = survey.cameras.size_px[:, None].float()

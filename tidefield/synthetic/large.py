@@ -103,15 +103,12 @@ def make_large_flight(
     if not missing:
         return
     delete_partials(*(files[i] for i in missing))
-    flat = make()
+    flat, seconds = make(), plan.flight.seconds(len(files))
     for first in range(0, len(missing), _PIECE):
         piece = missing[first : first + _PIECE]
         below = ground_extent(cameras[piece], plan.flight)
         part = flat.with_plants_within((below.west_m, below.south_m), (below.east_m, below.north_m))
-        tasks = [
-            partial(_write, part, cameras[i], plan, files[i], stated[i], _START + timedelta(seconds=_SECONDS * i))
-            for i in piece
-        ]
+        tasks = [partial(_write, part, cameras[i], plan, files[i], stated[i], seconds[i], i) for i in piece]
         in_parallel(tasks, "cpu")
         progress(len(files) - len(missing) + first + len(piece), len(files))
 
@@ -165,8 +162,7 @@ def planned_flight(plan: LargeFlight) -> tuple[Cameras, Float64[np.ndarray, "V 3
     names = [f"{plan.category}_{i + 1:0{digits}d}.jpg" for i in range(len(cameras))]
 
     def make() -> TidalFlat:
-        elevation, azimuth = float(random.uniform(42, 60)), float(random.uniform(0, 360))
-        task = partial(make_flat, settings, _extent(cameras, plan.flight), elevation, azimuth, random)
+        task = partial(make_flat, plan.flight.date(settings, random), _extent(cameras, plan.flight), random)
         [flat] = in_parallel([task], "cpu")
         return flat
 
@@ -197,9 +193,11 @@ def _write(
     plan: LargeFlight,
     file: Path,
     place: Float64[np.ndarray, "3"],
-    time: datetime,
+    seconds: float,
+    number: int,
 ) -> None:
-    colour, _ = flat.photograph(camera, plan.supersample)
+    colour, _ = flat.photograph(camera, plan.supersample, seconds)
+    time = _START + timedelta(seconds=_SECONDS * number)
     pixels = (colour * 255).round().to(torch.uint8).numpy()
     with completed_file(file) as partial_file, partial_file.open("wb") as stream:
         Image.fromarray(pixels).save(stream, "JPEG", quality=95, exif=_exif(camera, place, time).tobytes())

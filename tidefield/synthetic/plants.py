@@ -7,6 +7,7 @@ this is exact ray tracing without a search structure.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -111,18 +112,22 @@ class Stems:
     def depth(self, i: Int[Tensor, " R"], rays: Rays) -> Float[Tensor, " R"]:
         """Find the depth at which each ray meets its numbered capsule; inf where it misses."""
         (origin, direction), start, radius = rays, self.start[:, i], self.radius[i]
-        axis, offset = self.end[:, i] - start, origin - start
+        axis, offset, dd = self.end[:, i] - start, origin - start, dot(direction, direction)
+        # From the ray's nearest point to the stem's middle on: in single precision, the squares of a long way to it
+        # leave nothing of the square of a radius.
+        near = dot(0.5 * axis - offset, direction) / dd
+        offset = offset + near * direction
         aa, ad, ao = dot(axis, axis), dot(axis, direction), dot(axis, offset)
-        dd, do, oo = dot(direction, direction), dot(direction, offset), dot(offset, offset)
+        do, oo = dot(direction, offset), dot(offset, offset)
         # The side: |offset + t d - axis (ao + t ad) / aa| = radius.
         qa, qb, qc = dd - ad * ad / aa, do - ad * ao / aa, oo - ao * ao / aa - radius * radius
         side = (-qb - torch.sqrt(qb * qb - qa * qc)) / qa
         along = (ao + side * ad) / aa
-        nearest = torch.where((along >= 0) & (along <= 1) & (side > 0), side, torch.inf)
+        nearest = torch.where((along >= 0) & (along <= 1) & (near + side > 0), near + side, torch.inf)
         # The balls at both ends.
         for do_end, oo_end in ((do, oo), (do - ad, oo - 2 * ao + aa)):
             ball = (-do_end - torch.sqrt(do_end * do_end - dd * (oo_end - radius * radius))) / dd
-            nearest = torch.minimum(nearest, torch.where(ball > 0, ball, torch.inf))
+            nearest = torch.minimum(nearest, torch.where(near + ball > 0, near + ball, torch.inf))
         return nearest
 
     def radiance(self, light: Light, shadows: Shadows, i: Int[Tensor, " R"], rays: Rays) -> Float[Tensor, "3 R"]:
@@ -238,35 +243,83 @@ def marsh_map(settings: Settings, terrain: Terrain, random: np.random.Generator)
     return smoothstep(level - 0.06, level + 0.14, score) * dry
 
 
-def grow(settings: Settings, terrain: Terrain, marsh: Float[Tensor, "H W"], random: np.random.Generator) -> Plants:
-    """Grow all plants of a flat."""
-    site = Raster(terrain.extent, torch.stack([terrain.ground, marsh, terrain.water_depth]))
-    tufts = _tufts(settings, site, random)
-    crowns, stems = _trees(settings, site, random)
-    # Each part holds the fields of Leaves in their order.
-    leaves = (np.concatenate(field, axis=-1).astype(np.float32) for field in zip(*tufts, *crowns, strict=True))
-    table = torch.tensor(stems, dtype=torch.float32).reshape(-1, 10).T.contiguous()
-    return Plants(Leaves(*map(torch.from_numpy, leaves)), Stems(table[0:3], table[3:6], table[6], table[7:10]))
+def grow(
+    settings: Settings, dates: Sequence[tuple[Terrain, Float[Tensor, "H W"]]], random: np.random.Generator
+) -> list[Plants]:
+    """Grow all plants of a flat at each date; what is drawn of a plant is the same at all dates at which it stands.
+
+    Args:
+        settings: of the first date.
+        dates: the terrain, and how densely plants cover it.
+    """
+    sites = [
+        Raster(terrain.extent, torch.stack([terrain.ground, marsh, terrain.water_depth])) for terrain, marsh in dates
+    ]
+    tufts, tiers = _tufts(settings, sites, random)
+    trees, crowns, stems = _trees(settings, sites, random)
+    grown = []
+    for of_tufts, of_trees in zip(tufts, trees, strict=True):
+        leaves = [*(part.standing(*of_tufts) for part in tiers), *(part.standing(*of_trees) for part in crowns)]
+        fields = (np.concatenate(field, axis=-1) for field in zip(*leaves, strict=True))
+        grown.append(Plants(Leaves(*map(_single, fields)), Stems(*map(_single, stems.standing(*of_trees)))))
+    return grown
 
 
-def _random_places(site: Raster, count: int, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Draw ground points [3 count]; return them with marsh density and water depth [2 count]."""
-    extent = site.extent
+def _single(values: np.ndarray) -> Tensor:
+    return torch.from_numpy(values.astype(np.float32, order="C"))
+
+
+_Stand = tuple[np.ndarray, np.ndarray]
+"""The feet [3 N] of some plants on the ground of a date, and which of them [N] stand there."""
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """Leaves or stems of plants.
+
+    Attributes:
+        plant: the number of the plant that each belongs to.
+        points: the first fields of Leaves or Stems, from the plant's foot.
+        rest: the other fields, in their order.
+    """
+
+    plant: Int[np.ndarray, " N"]
+    points: tuple[np.ndarray, ...]
+    rest: tuple[np.ndarray, ...]
+
+    def standing(self, feet: np.ndarray, stands: np.ndarray) -> list[np.ndarray]:
+        """The fields of what stands at a date."""
+        here = stands[self.plant]
+        foot = feet[:, self.plant[here]]
+        return [*(foot + point[:, here] for point in self.points), *(field[..., here] for field in self.rest)]
+
+
+def _candidates(
+    sites: list[Raster], count: int, random: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Draw places; return them on the ground of each date [D 3 N] with marsh density and water depth [D N]."""
+    extent = sites[0].extent
     x = random.uniform(extent.west_m, extent.east_m, count).astype(np.float32)
     y = random.uniform(extent.south_m, extent.north_m, count).astype(np.float32)
-    height, *cover = site.sample(torch.from_numpy(np.stack([x, y]))).numpy()
-    return np.stack([x, y, height]), np.stack(cover)
+    xy = np.stack([x, y])
+    height, marsh, water = np.stack([site.sample(torch.from_numpy(xy)).numpy() for site in sites], axis=1)
+    return np.stack([np.stack([x, y, z]) for z in height]), marsh, water
 
 
-def _tufts(settings: Settings, site: Raster, random: np.random.Generator) -> list[tuple[np.ndarray, ...]]:
+def _at_any_date(feet: np.ndarray, stands: np.ndarray) -> tuple[list[_Stand], int]:
+    """Leave out candidates that stand at no date; return those of each date, and how many are left."""
+    kept = stands.any(0)
+    return [(own[:, kept], here[kept]) for own, here in zip(feet, stands, strict=True)], int(kept.sum())
+
+
+def _tufts(settings: Settings, sites: list[Raster], random: np.random.Generator) -> tuple[list[_Stand], list[_Parts]]:
     """Grow rosettes of blades, three tiers high."""
-    width, height = site.extent.size_m
+    width, height = sites[0].extent.size_m
     count = int(settings.tufts_per_m2 * width * height)
-    base, (marsh, water) = _random_places(site, count, random)
+    feet, marsh, water = _candidates(sites, count, random)
     stray = 0.012 * (water == 0)
-    base = base[:, random.random(count) < np.maximum(marsh, stray)]
-    count = base.shape[1]
-    hue = Noise(random, channels=2).fractal(torch.from_numpy(base[:2]), 14.0, 3).numpy()
+    dates, count = _at_any_date(feet, random.random(count) < np.maximum(marsh, stray))
+    hue = Noise(random, channels=2).fractal(torch.from_numpy(dates[0][0][:2]), 14.0, 3).numpy()
     tall = np.clip(0.55 + 0.45 * hue[1] + 0.15 * random.normal(size=count), 0.22, 1.05)
     spread = np.clip(0.36 * tall + 0.1 * random.normal(size=count), 0.14, 0.55)
     kind = np.clip(np.floor((hue[0] * 0.9 + 0.5) * 3.2 + random.normal(0, 0.7, count)), 0, 4).astype(int)
@@ -279,8 +332,9 @@ def _tufts(settings: Settings, site: Raster, random: np.random.Generator) -> lis
         albedo = _GRASS[kind].T * random.lognormal(0, 0.16, count) * shade
         outline = random.integers(6, 13, count), random.uniform(0, 6, count), random.uniform(0.6, 0.85, count)
         u, v = u * spread * size, v * spread * size * 0.8
-        tiers.append((base + np.stack(offset), u, v, *outline, albedo, np.full(count, openness)))
-    return tiers
+        rest = (u, v, *outline, albedo, np.full(count, openness))
+        tiers.append(_Parts(np.arange(count), (np.stack(offset),), rest))
+    return dates, tiers
 
 
 def _tangents(normal: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -293,28 +347,33 @@ def _tangents(normal: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _trees(
-    settings: Settings, site: Raster, random: np.random.Generator
-) -> tuple[list[tuple[np.ndarray, ...]], list[list[float]]]:
+    settings: Settings, sites: list[Raster], random: np.random.Generator
+) -> tuple[list[_Stand], list[_Parts], _Parts]:
     """Grow mangroves: the leaves of each crown, and all stems."""
-    width, height = site.extent.size_m
+    width, height = sites[0].extent.size_m
     wanted = random.poisson(settings.trees_per_ha * width * height / 1e4)
-    bases, (marsh, water) = _random_places(site, 60 * wanted + 1, random)
+    feet, marsh, water = _candidates(sites, 60 * wanted + 1, random)
     # In marsh first, on other dry ground where there is little of it, and now and then in shallow water.
     chance = np.where(water > 0, 0.004 * (water < 0.4), 0.02 + 0.6 * marsh)
-    bases = bases[:, random.random(bases.shape[1]) < chance][:, :wanted]
+    stands = random.random(60 * wanted + 1) < chance
+    # Up to the candidate that is the last one wanted at the first date.
+    stands &= np.cumsum(stands[0]) - stands[0] < wanted
+    dates, count = _at_any_date(feet, stands)
     crowns, stems = [], []
-    for base in bases.T:
+    for tree in range(count):
         tall = random.uniform(2.0, 5.0)
         radius = tall * random.uniform(0.32, 0.52)
         bare = random.random() < 0.12
-        stems += _trunk(base, tall, radius, bare, random)
+        stems += [[tree, *piece] for piece in _trunk(tall, radius, bare, random)]
         if not bare:
-            crowns.append(_crown(base, tall, radius, random))
-    return crowns, stems
+            offset, *rest = _crown(tall, radius, random)
+            crowns.append(_Parts(np.full(offset.shape[1], tree), (offset,), tuple(rest)))
+    table = np.array(stems, dtype=np.float64).reshape(-1, 11).T
+    return dates, crowns, _Parts(table[0].astype(int), (table[1:4], table[4:7]), (table[7], table[8:11]))
 
 
-def _crown(base: np.ndarray, tall: float, radius: float, random: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """Place sprays on the shells of a few overlapping lobes."""
+def _crown(tall: float, radius: float, random: np.random.Generator) -> tuple[np.ndarray, ...]:
+    """Place sprays on the shells of a few overlapping lobes: fields of Leaves, centres from the tree's foot."""
     lobes = random.integers(3, 7)
     angle, out = random.uniform(0, 2 * math.pi, lobes), random.uniform(0.2, 0.62, lobes) * radius
     middle = np.stack([out * np.cos(angle), out * np.sin(angle), tall * random.uniform(0.62, 0.86, lobes)])
@@ -336,27 +395,27 @@ def _crown(base: np.ndarray, tall: float, radius: float, random: np.random.Gener
     young = smoothstep(-0.8, 0.9, direction[2])
     albedo = tone * random.lognormal(0, 0.2, count) * (0.75 + 0.5 * young)
     outline = random.integers(4, 8, count), random.uniform(0, 6, count), random.uniform(0.35, 0.65, count)
-    return base[:, None] + offset, u * spray, v * spray * 0.7, *outline, albedo, 0.3 + 0.7 * young * at
+    return offset, u * spray, v * spray * 0.7, *outline, albedo, 0.3 + 0.7 * young * at
 
 
-def _trunk(base: np.ndarray, tall: float, radius: float, bare: bool, random: np.random.Generator) -> list[list[float]]:
+def _trunk(tall: float, radius: float, bare: bool, random: np.random.Generator) -> list[list[float]]:
     """Grow a few crooked stems from one foot, and arching prop roots; a row of numbers for each straight piece."""
     rows = []
     bark = _BARK[random.integers(0, len(_BARK))]
     for _ in range(random.integers(2, 5)):
         angle, lean = random.uniform(0, 2 * math.pi), random.uniform(0.15, 0.6) * radius
         way = np.array([math.cos(angle), math.sin(angle), 0.0])
-        joints = [base + (0.1 * way - 0.1 * _UP)]
+        joints = [0.1 * way - 0.1 * _UP]
         pieces = max(3, round(tall / 0.8))
         for k in range(1, pieces + 1):
             s = k / pieces
             sway = random.normal(0, 0.06, 2)
-            joints.append(base + (lean * s**0.8 * way + np.array([*sway, tall * s * (1.0 if bare else 0.8)])))
+            joints.append(lean * s**0.8 * way + np.array([*sway, tall * s * (1.0 if bare else 0.8)]))
         thick = random.uniform(0.05, 0.11) * tall / 4 + 0.02
         rows += [[*a, *b, thick * (1 - 0.6 * k / pieces), *bark] for k, (a, b) in enumerate(pairwise(joints))]
     for _ in range(random.integers(3, 8)):
         angle, out = random.uniform(0, 2 * math.pi), random.uniform(0.3, 0.9) * (0.4 + 0.25 * radius)
         way = np.array([math.cos(angle), math.sin(angle), 0.0])
-        joints = [base + (0.25 * out + 0.45) * _UP, base + 0.6 * out * way + 0.4 * _UP, base + out * way - 0.15 * _UP]
+        joints = [(0.25 * out + 0.45) * _UP, 0.6 * out * way + 0.4 * _UP, out * way - 0.15 * _UP]
         rows += [[*a, *b, 0.035, *(0.8 * bark)] for a, b in pairwise(joints)]
     return rows

@@ -15,9 +15,9 @@ from torch import Tensor
 from tidefield.data.scene import SparsePoints
 from tidefield.geometry.cameras import Cameras, pixel_grid
 from tidefield.parallel import in_parallel
-from tidefield.synthetic.flat import TidalFlat, make_flat
+from tidefield.synthetic.flat import Date, TidalFlat, make_flat
 from tidefield.synthetic.grids import Extent
-from tidefield.synthetic.settings import settings_for
+from tidefield.synthetic.settings import Settings, settings_for
 
 _CELL_PER_ALTITUDE = 0.0035
 """Spacing of the terrain's nodes: some two thirds of a pixel of a photograph 240 wide, whatever the altitude."""
@@ -59,6 +59,18 @@ class Flight:
     """None draws it between 42 and 60 from the seed."""
     wetness: float | None = None
     """0 to 1; None for that of the category."""
+
+    def date(self, settings: Settings, random: np.random.Generator) -> Date:
+        """What a flat is like when it is photographed: the settings with this flight's wetness, and the sun."""
+        if self.wetness is not None:
+            settings = replace(settings, wetness=self.wetness)
+        elevation = float(random.uniform(42, 60)) if self.sun_elevation_deg is None else self.sun_elevation_deg
+        return Date(settings, elevation, float(random.uniform(0, 360)))
+
+    def seconds(self, views: int) -> list[float]:
+        """Times of the photographs, for the wavelets."""
+        # In single precision, on which the photographs of a seed depend.
+        return torch.tensor([i * self.water_motion for i in range(views)]).tolist()
 
 
 @dataclass(frozen=True)
@@ -108,14 +120,11 @@ def make_survey(
     flight = flight or Flight()
     random = np.random.default_rng([seed, 20260])
     settings = settings_for(category, random)
-    if flight.wetness is not None:
-        settings = replace(settings, wetness=flight.wetness)
     cameras = fly(flight, views, width, random)
     extent = ground_extent(cameras, flight)
-    elevation = flight.sun_elevation_deg if flight.sun_elevation_deg is not None else random.uniform(42, 60)
-    azimuth = random.uniform(0, 360)
+    date = flight.date(settings, random)
     # As a task of its own: then the flat does not depend on the number of cores.
-    [flat] = in_parallel([partial(make_flat, settings, extent, elevation, azimuth, random)], "cpu")
+    [flat] = in_parallel([partial(make_flat, date, extent, random)], "cpu")
     return photograph_flat(category, seed, flat, cameras, flight, supersample, random)
 
 
@@ -129,15 +138,13 @@ def photograph_flat(
     random: np.random.Generator,
 ) -> Survey:
     """Take the photographs of a flight, and make their sparse points."""
-    views = len(cameras)
-    # In single precision, on which the photographs of a seed depend.
-    seconds = torch.tensor([i * flight.water_motion for i in range(views)]).tolist()
+    seconds = flight.seconds(len(cameras))
 
     def photograph(i: int) -> tuple[Tensor, Tensor]:
         colour, depth = flat.photograph(cameras[i], supersample, seconds[i])
         return (colour * 255).round().to(torch.uint8), depth
 
-    made = in_parallel([partial(photograph, i) for i in range(views)], "cpu")
+    made = in_parallel([partial(photograph, i) for i in range(len(cameras))], "cpu")
     photographs, depth = (torch.stack(parts) for parts in zip(*made, strict=True))
     cameras = replace(cameras, near_far=_near_far(depth))
     points = _sparse_points(flat, cameras, photographs, depth, random)

@@ -17,7 +17,7 @@ from jaxtyping import Float, Float32
 from torch import Tensor
 
 from tidefield.parallel import in_parallel
-from tidefield.synthetic.flat import make_flat
+from tidefield.synthetic.flat import make_flats
 from tidefield.synthetic.grids import Extent, Raster, blurred, smoothstep
 from tidefield.synthetic.settings import settings_for
 from tidefield.synthetic.survey import Flight, Survey, fly, ground_extent, photograph_flat
@@ -39,14 +39,12 @@ class Difference:
         marsh_growth: the share of the dry ground that is marsh becomes this many times as large.
         tide_m: how much higher the water stands.
         sun_turn_deg: how far the sun's azimuth has moved.
-        sun_elevation_deg: of the second date; that of the first if None.
     """
 
     change_m: float = 0.1
     marsh_growth: float = 1.5
     tide_m: float = -0.1
     sun_turn_deg: float = 100.0
-    sun_elevation_deg: float | None = None
 
 
 def ground_change(terrain: Terrain, change_m: float, random: np.random.Generator) -> Float[Tensor, "H W"]:
@@ -115,7 +113,8 @@ def make_pair(
         difference: between the dates; None for the defaults.
         views: photographs of each survey.
         width: of a photograph, pixels.
-        flights: of both dates; None for the defaults, the second one 10% higher.
+        flights: of both dates; None for the defaults, the second one 10% higher. A later flight without an elevation
+            of the sun has that of the earlier one.
 
     Raises:
         SceneError: the category is unknown.
@@ -134,19 +133,17 @@ def make_pair(
     low = [min(e.west_m for e in extents), min(e.south_m for e in extents)]
     high = [max(e.east_m for e in extents), max(e.north_m for e in extents)]
     extent = Extent.around(low, high, min(e.cell_m for e in extents))
-    shared = np.random.default_rng([seed, 20262])
-    elevation, azimuth = float(shared.uniform(42, 60)), float(shared.uniform(0, 360))
-    suns = [
-        (elevation, azimuth),
-        (difference.sun_elevation_deg or elevation, (azimuth + difference.sun_turn_deg) % 360),
-    ]
-    change = partial(_change, change_m=difference.change_m, seed=seed)
-    tasks = [
-        partial(make_flat, of, extent, *sun, np.random.default_rng([seed, 20263]), change if k else None)
-        for k, (of, sun) in enumerate(zip((settings, later_settings), suns, strict=True))
-    ]
-    # As tasks of their own: then the flats do not depend on the number of cores.
-    flats = [in_parallel([task], "cpu")[0] for task in tasks]
+    earlier = flights[0].date(settings, np.random.default_rng([seed, 20262]))
+    later = replace(
+        flights[1].date(later_settings, np.random.default_rng([seed, 20262])),
+        sun_azimuth_deg=(earlier.sun_azimuth_deg + difference.sun_turn_deg) % 360,
+        change=partial(_change, change_m=difference.change_m, seed=seed),
+    )
+    if flights[1].sun_elevation_deg is None:
+        later = replace(later, sun_elevation_deg=earlier.sun_elevation_deg)
+    task = partial(make_flats, (earlier, later), extent, np.random.default_rng([seed, 20263]))
+    # As a task of its own: then the flats do not depend on the number of cores.
+    [flats] = in_parallel([task], "cpu")
     surveys = [
         photograph_flat(category, seed, flat, camera, flight, supersample, random)
         for flat, camera, flight, random in zip(flats, cameras, flights, randoms, strict=True)
