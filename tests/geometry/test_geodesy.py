@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 from pyproj import Geod, Transformer
 
-from tidefield.geometry.geodesy import LocalFrame, has_unstated_unit, metres_per_degree, parse_crs, utm_zone
+from tidefield.geometry.geodesy import (
+    LocalFrame,
+    has_unstated_unit,
+    metres_per_degree,
+    near_longitude,
+    parse_crs,
+    utm_zone,
+)
 
 BNG_PROJ4 = (
     "+proj=tmerc +lat_0=49 +lon_0=-2 +k=0.9996012717 +x_0=400000 +y_0=-100000 +ellps=airy "
@@ -181,3 +188,12 @@ def test_products_of_control_in_web_mercator_are_in_true_metres():
     placed = frame.from_system("EPSG:3857", np.array([[x, y, 2.0], [x + 168.0, y, 2.0]]))
     assert np.linalg.norm(placed[1] - placed[0]) == pytest.approx(100, rel=0.01)
     assert LocalFrame.at("EPSG:27700", (351_200.0, 512_900.0, 260.0)).crs == "EPSG:27700"
+
+
+def test_longitudes_continue_across_the_date_line_and_stay_exact_elsewhere():
+    longitudes = np.array([179.9, -179.9, 180.0, 0.1, -2.75, np.nan])
+    found = near_longitude(longitudes, 179.0)
+    np.testing.assert_allclose(found[:3], [179.9, 180.1, 180.0], rtol=0, atol=1e-12)
+    assert np.isnan(found[5])
+    np.testing.assert_array_equal(near_longitude(longitudes[:5], 0.0), longitudes[:5])
+    assert near_longitude(285.0, 0.0) == -75.0

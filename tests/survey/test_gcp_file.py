@@ -1,5 +1,6 @@
 """Ground control is read from ODM's gcp_list.txt; errors, and control of another site, are refused."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -225,6 +226,13 @@ def test_the_system_that_fits_is_named(crs, x, y, expected):
     message = refusal(crs, x, y)
     assert expected in message
     assert " km from the photographs" in message or "nowhere near" in message
+
+
+def test_zones_of_the_datums_that_receivers_use_are_suggested_first():
+    message = refusal("EPSG:32631", 516100.0, 6040500.0)
+    first, second, *_ = re.findall(r"EPSG:(\d+) \(", message.partition("would fit in ")[2])
+    assert {first, second} == {"25830", "32630"}
+    assert "WGS 72" not in message
 
 
 def test_coordinates_outside_of_the_domain_of_a_system_are_refused():

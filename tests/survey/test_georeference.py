@@ -23,12 +23,15 @@ from located_surveys import (
     quiet,
     with_control,
 )
+from scipy.spatial.transform import Rotation
 
 from tidefield.data.georeference import Georeference
 from tidefield.errors import SurveyError
 from tidefield.survey.georeference import bundle_adjustment
 from tidefield.survey.georeference.georeference import georeference
 from tidefield.survey.georeference.gps_alignment import camera_centres, find_down, given_positions
+from tidefield.survey.io.positions import read_gps_file
+from tidefield.survey.io.text_files import PhotographNames
 from tidefield.survey.survey import Survey
 
 
@@ -183,6 +186,26 @@ def test_a_single_strip_is_levelled_by_gimbal_angles_if_given():
     down = np.array([model.image(i + 1).cam_from_world().rotation.matrix()[2] for i in range(12)])
     truth = np.array([flight.model.image(i + 1).cam_from_world().rotation.matrix()[2] for i in range(12)])
     assert np.abs(down[:, 2] - truth[:, 2]).max() < 0.01
+
+
+@pytest.mark.parametrize(("pitch_deg", "roll_deg"), [(0.0, 0.0), (12.0, 0.0), (0.0, 8.0), (-6.0, -20.0), (35.0, 10.0)])
+def test_the_vertical_of_a_drone_without_a_gimbal_is_that_of_its_angles(tmp_path, pitch_deg, roll_deg):
+    """One line, flown with a bank: camera axes right, down, forward are the drone's right, back, down."""
+    flight, lines = fly(lines=1, each=12), ["EPSG:4326"]
+    for i in range(12):
+        body = Rotation.from_euler("ZYX", (20.0 * i, pitch_deg + 0.1 * i, roll_deg - 0.1 * i), degrees=True)
+        camera_ned = body.as_matrix() @ [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+        R = camera_ned.T @ [[0, 1, 0], [1, 0, 0], [0, 0, -1]]  # from east, north and up
+        frame = flight.model.frames[flight.model.image(i + 1).frame_id]
+        frame.rig_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(R), -R @ flight.centres_world[i])
+        yaw, pitch, roll = body.as_euler("ZYX", degrees=True)
+        lines.append(f"{name_of(i)} -2.75 54.5 300 {yaw} {pitch} {roll}")
+    (tmp_path / "geo.txt").write_text("\n".join(lines))
+    records, _ = read_gps_file(tmp_path / "geo.txt", PhotographNames(map(name_of, range(12))))
+    photographs = [replace(p, gimbal_deg=records[p.name].gimbal_deg) for p in flight.survey.photographs]
+    down = find_down(flight.model, photographs)
+    assert "gimbal" in down.source
+    np.testing.assert_allclose(down.direction_model, (0, 0, -1), atol=1e-6)
 
 
 def looking(forward: np.ndarray, centres: np.ndarray, points: np.ndarray, position_m: float) -> Flight:

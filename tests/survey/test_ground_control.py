@@ -97,6 +97,17 @@ def test_control_points_are_not_added_to_the_model(flight):
     assert model.compute_mean_reprojection_error() == pytest.approx(0.36, abs=0.08)
 
 
+@pytest.mark.parametrize(("kept", "why"), [(2, "three are needed"), (15, "they do not follow the photographs")])
+def test_positions_that_took_no_part_are_not_compared_with(flight, kept, why):
+    survey = with_control(flight)
+    one = survey.photographs[0].position
+    photographs = tuple(replace(p, position=one if i < kept else None) for i, p in enumerate(survey.photographs))
+    _, found = located(flight, replace(survey, photographs=photographs))
+    assert found.source == "ground control"
+    assert found.gps.names == ()
+    assert any(note.startswith("The positions of ") and note.endswith(f"are not used: {why}.") for note in found.notes)
+
+
 @pytest.mark.thorough
 def test_errors_of_control_are_what_the_model_has_minus_what_was_surveyed(flight):
     survey = with_control(flight)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from camera_files import BRIGHTON, exif, named, one, photograph, real_survey, survey_folder, xmp
 from PIL.ExifTags import GPS, Base
+from scipy.spatial.transform import Rotation
 
 from tidefield.data.exif import Exif
 from tidefield.survey.georeference.gps_alignment import given_positions
@@ -264,10 +265,22 @@ def test_pix4d_tags_give_angles_and_accuracies(tmp_path):
         }
     )
     read = one(tmp_path, table=exif(place=BRIGHTON), packet=packet)
-    assert read.gimbal_deg == (90.0, -80.0, -2.0)
+    assert read.gimbal_deg == pytest.approx((101.371, -79.804, -11.195), abs=1e-3)
     assert read.position is not None
     assert (read.position.horizontal_m, read.position.vertical_m) == (0.02, 0.04)
     assert read.relative_altitude_m == 120.0
+
+
+@pytest.mark.parametrize(("make", "roll_deg"), [("MicaSense", 8.0), ("senseFly", -8.0)])
+def test_pix4d_angles_are_those_of_the_drone_that_carries_the_camera(tmp_path, make, roll_deg):
+    packet = xmp({"Camera:Yaw": "30", "Camera:Pitch": "5", "Camera:Roll": "8"})
+    read = one(tmp_path, table=exif({Base.Make: make}, place=BRIGHTON), packet=packet)
+    assert read.gimbal_deg is not None
+    body = Rotation.from_euler("ZYX", (30.0, 5.0, roll_deg), degrees=True)
+    camera = Rotation.from_euler("ZYX", read.gimbal_deg, degrees=True)
+    # North, east and down: of the picture's right, down and forward axes.
+    of_nadir, of_gimbal = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]])
+    np.testing.assert_allclose(camera.as_matrix() @ of_gimbal, body.as_matrix() @ of_nadir, atol=1e-9)
 
 
 def test_angles_in_a_structure_are_found(tmp_path):

@@ -200,7 +200,7 @@ def test_titles_change_nothing_of_a_geo_txt_in_tabs(tmp_path, titles):
     bare, _ = read_gps_file(written(tmp_path, f"EPSG:4979\n{rows}", "geo.txt"), NAMES)
     titled, _ = read_gps_file(written(tmp_path, f"EPSG:4979\n{titles}\n{rows}", "geo.txt"), NAMES)
     assert titled == bare
-    assert titled["DJI_0001.JPG"].gimbal_deg == (90, -85, 1)
+    assert titled["DJI_0001.JPG"].gimbal_deg == pytest.approx((78.675, -84.901, 11.281), abs=1e-3)
     assert titled["100MEDIA/DJI_0002.JPG"].gimbal_deg is None
 
 
@@ -295,7 +295,7 @@ def test_angles_and_accuracies_of_a_geo_txt_are_read(tmp_path):
     )
     found, _ = read_gps_file(written(tmp_path, text, "geo.txt"), NAMES)
     first, second = found["DJI_0001.JPG"], found["100MEDIA/DJI_0002.JPG"]
-    assert first.gimbal_deg == (90, -85, 1)
+    assert first.gimbal_deg == pytest.approx((78.675, -84.901, 11.281), abs=1e-3)
     assert (first.position.horizontal_m, first.position.vertical_m) == (0.02, 0.04)
     assert second.gimbal_deg is None  # three zeros stand for angles that are not available
     assert math.isnan(found["Watt, Süd 3.jpeg"].position.height_m)
@@ -496,6 +496,32 @@ def test_letters_of_the_hemispheres_beside_unsigned_degrees_are_signs(tmp_path):
     position = found["DJI_0001.JPG"].position
     assert (position.latitude_deg, position.longitude_deg) == (-33.9, pytest.approx(-58.4))
     assert not any("Ref" in remark for remark in remarks)
+
+
+@pytest.mark.parametrize(
+    "titles", ["lat,lat_ref,lon,lon_ref", "latitude,N/S,longitude,E/W", "lat,NS,lon,EW", "Lat,hemisphere,Long,side"]
+)
+@pytest.mark.parametrize("south", ["S", "s", "South"])
+def test_hemispheres_are_known_by_what_is_in_their_columns(tmp_path, titles, south):
+    text = f"image,{titles}\nDJI_0001.JPG,41.47,{south},72.94,W\nDJI_0002.JPG,41.47,,72.95,E\n"
+    found, remarks = read_gps_file(written(tmp_path, text), NAMES)
+    places = [(r.position.latitude_deg, r.position.longitude_deg) for r in found.values()]
+    assert places == [(-41.47, pytest.approx(-72.94)), (41.47, 72.95)]
+    assert remarks == []
+
+
+def test_a_column_of_other_words_is_no_hemisphere(tmp_path):
+    text = "image,lat,lon,wind,line\nDJI_0001.JPG,41.47,72.94,W,S\nDJI_0002.JPG,41.47,72.95,SW,3\n"
+    found, _ = read_gps_file(written(tmp_path, text), NAMES)
+    assert {record.position.latitude_deg for record in found.values()} == {41.47}
+    assert {record.position.longitude_deg for record in found.values()} == {72.94, 72.95}
+
+
+@pytest.mark.parametrize("titles", ["x,y,z,latitude,longitude,altitude", "X [m],Y [m],Z [m],lat_deg,lon_deg,alt_m"])
+def test_coordinates_of_a_grid_do_not_hide_latitude_and_longitude(tmp_path, titles):
+    text = f"image,{titles}\nDJI_0001.JPG,673456.1,5412345.2,3,-41.47,-72.94,12\n"
+    position = read_gps_file(written(tmp_path, text), NAMES)[0]["DJI_0001.JPG"].position
+    assert (position.latitude_deg, position.longitude_deg, position.height_m) == (-41.47, -72.94, 12)
 
 
 def test_longitudes_that_count_to_360_are_those_of_the_west(tmp_path):

@@ -134,6 +134,51 @@ def test_one_stop_more_or_less_is_kept(tmp_path):
     assert not left_out(flight(tmp_path, less=with_light(view(500, 300), 0.5), more=with_light(view(900, 300), 2)))
 
 
+def test_a_whole_survey_in_the_dark_is_found_and_one_at_dusk_kept(tmp_path):
+    for share, name in ((0.01, "dark"), (0.08, "dusk")):
+        for index in range(5):
+            photograph(tmp_path / name / f"{index}.jpg", pixels=with_light(view(130 * index), share))
+    assert not left_out(read_survey(tmp_path / "dusk"))
+    found = left_out(read_survey(tmp_path / "dark"))
+    assert len(found) == 5
+    assert all(reason.startswith(("under-exposed", "flat")) for reason in found.values())
+    of_lit_ground = Measures(0.3, 8.0, 15.0, 0.002, 0.0, 0.0, 18.1, 0.0)  # turin_lot at this share
+    reason = _flat_or_badly_exposed(of_lit_ground, [of_lit_ground] * 6) or ""
+    assert reason.startswith("under-exposed: 95% of it is darker than level 15 of 255, and 98% lies within 18 levels")
+
+
+def test_what_is_transparent_is_neither_white_nor_sky(tmp_path):
+    for index in range(5):
+        alpha = np.zeros(SIZE[::-1], np.uint8)
+        cv2.circle(alpha, (SIZE[0] // 2, SIZE[1] // 2), 140, 255, -1)
+        photograph(tmp_path / f"{index}.png", pixels=np.dstack([view(130 * index), alpha]))
+    survey = read_survey(tmp_path)
+    assert all(p.has_alpha for p in survey.photographs)
+    decisions = assess_quality(survey)
+    assert not any(decision.left_out for decision in decisions)
+    assert not any(decision.measures and decision.measures.white for decision in decisions)
+
+
+def test_what_is_masked_is_not_judged(tmp_path):
+    glare = view(500, 300).copy()
+    glare[:, :200] = 255
+    survey = flight(tmp_path, sky=sky(0.5), glare=glare)
+    assert sorted(left_out(survey)) == ["glare.jpg", "sky.jpg"]
+    for name, part in (("sky", np.s_[:150]), ("glare", np.s_[:, :200])):
+        mask = np.full(SIZE[::-1], 255, np.uint8)
+        mask[part] = 0
+        photograph(tmp_path / "masks" / f"{name}.jpg.png", pixels=mask)
+    decisions = {decision.name: decision for decision in assess_quality(read_survey(tmp_path))}
+    assert not any(decision.left_out for decision in decisions.values())
+    assert decisions["sky.jpg"].measures.sky == decisions["glare.jpg"].measures.white == 0
+
+
+def test_a_mask_of_everything_is_no_mask(tmp_path):
+    flight(tmp_path, count=5)
+    photograph(tmp_path / "masks" / "f00.jpg.png", pixels=np.zeros(SIZE[::-1], np.uint8))
+    assert not left_out(read_survey(tmp_path))
+
+
 def test_neighbours_without_light_or_sharpness_are_nothing_to_compare_with():
     bright = Measures(0.1, 200.0, 250.0, 0.6, 0.9, 0.1, 100.0, 0.0)
     assert _flat_or_badly_exposed(bright, [replace(bright, light=0.0)] * 6) is None
@@ -168,6 +213,20 @@ def test_a_photograph_of_the_sky_is_found_without_metadata(tmp_path):
     found = left_out(flight(tmp_path, sky=sky(0.5), strip=sky(0.2)))
     assert list(found) == ["sky.jpg"]
     assert found["sky.jpg"].startswith("horizon: 5") or found["sky.jpg"].startswith("horizon: 4")
+
+
+def test_smooth_water_in_several_photographs_of_one_place_is_no_sky(tmp_path):
+    flight(tmp_path)
+    x = np.arange(SIZE[0])
+    waterline = SIZE[1] * (0.42 + 0.04 * np.sin(x / SIZE[0] * 9) + 0.02 * np.sin(x / SIZE[0] * 31))
+    for index in range(3, 7):
+        pixels = view(130 * index).copy()
+        pixels[np.arange(SIZE[1])[:, None] < waterline] = 205
+        place = BRIGHTON[0] + 1.2e-4 * index, BRIGHTON[1]
+        photograph(tmp_path / f"f{index:02d}.jpg", table=exif(place=place), pixels=pixels)
+    decisions = assess_quality(read_survey(tmp_path))
+    assert [index for index, d in enumerate(decisions) if d.measures and d.measures.sky > 0.35] == [3, 4, 5, 6]
+    assert not any(decision.left_out for decision in decisions)
 
 
 @pytest.mark.parametrize(("pitch_deg", "share", "out"), [("-5", 0.45, True), ("-90", 0.45, False), ("-5", 0.0, False)])

@@ -30,10 +30,13 @@ from flat_surveys import (
 
 from tidefield.data.georeference import LeftOut, Residuals
 from tidefield.errors import RunError
+from tidefield.geometry.geodesy import LocalFrame
 from tidefield.survey.colour import ExposureCorrection
 from tidefield.survey.report import UnusedPhotograph, write_report
+from tidefield.survey.report.figures import draw_map, spaced
 from tidefield.survey.report.findings import MOST_THUMBNAILS
 from tidefield.survey.report.numbers import duration, plain
+from tidefield.survey.report.statistics import measure
 from tidefield.survey.survey import Control, Survey
 
 NASTY = '<script>alert(1)</script> & "O\'Brien" ümlaut.JPG'
@@ -294,6 +297,69 @@ def test_errors_count_only_what_was_used(tmp_path):
 def test_control_points_of_one_mark_are_counted_that_have_no_residuals(count, words):
     found = replace(located(), source="ground control", control_world=np.zeros((count, 3)))
     assert findings(georeference=found).placed_by == words
+
+
+@pytest.mark.parametrize(("points", "stated_m", "has_part"), [(8, 2.0, False), (2, 2.0, True), (8, 0.02, True)])
+def test_positions_are_named_only_where_they_placed_the_survey(points, stated_m, has_part):
+    """They complete two points, and those of differential receivers shape the survey."""
+    names = tuple(p.name for p in findings().survey.photographs)
+    world = np.random.default_rng(0).uniform(0, 60, (points, 3))
+    gps = Residuals(names, np.zeros((len(names), 3)))
+    found = findings(georeference=replace(located(gps=gps), source="ground control", control_world=world))
+    photographs = tuple(
+        replace(p, position=replace(p.position, horizontal_m=stated_m, vertical_m=stated_m))
+        for p in found.survey.photographs
+    )
+    found = replace(found, survey=replace(found.survey, photographs=photographs))
+    assert found.placed_by == f"{points} control points" + (", GPS of 18 photographs" if has_part else "")
+
+
+def test_a_comparison_of_which_nothing_could_be_used_is_reported(tmp_path):
+    unknown = residuals("check", error_m=np.full((2, 3), np.nan))
+    found = findings(georeference=located(check=unknown))
+    found = replace(found, survey=replace(found.survey, control=surveyed(unknown)))
+    text, table = report(found, tmp_path)
+    assert "none could be used" in "".join(Reader(text).text)
+    assert (table["check_errors"]["count"], table["check_errors"]["not_used"]) == (0, 2)
+
+
+def test_the_map_continues_across_the_date_line():
+    frame = LocalFrame.at("EPSG:4326", (180.0, -16.8, 0.0))
+    lost = photograph(100, np.array([40.0, 30, 60]))
+    longitude, latitude, _ = frame.to_geographic(np.array([[40.0, 30, 60]]))[0].tolist()
+    assert longitude < 0
+    lost = replace(lost, position=replace(lost.position, longitude_deg=longitude, latitude_deg=latitude))
+    found = findings(georeference=located(frame), left_out=(UnusedPhotograph(lost.name, "quality", "blurred"),))
+    found = replace(found, survey=replace(found.survey, photographs=(*found.survey.photographs, lost)))
+    page = Reader(str(draw_map(found, measure(found))))
+    east, west = ([text for text in page.text if text.endswith(f"° {side}")] for side in "EW")
+    assert east
+    assert west
+    assert all(text.startswith("179.99") for text in west)
+    cameras, there = page.markers["DJI_0002.JPG"], page.markers[f"{lost.name}: not in the model"]
+    np.testing.assert_allclose(np.subtract(there, cameras), np.array([8.0, -30]) * scale(page), atol=0.1)
+
+
+def scale(page: Reader) -> float:
+    """Units of a map for a metre, by two cameras of a line."""
+    return (page.markers["DJI_0005.JPG"][0] - page.markers["DJI_0000.JPG"][0]) / (5 * AHEAD)
+
+
+@pytest.mark.parametrize(
+    ("crs", "origin", "titles"),
+    [
+        ("EPSG:2048", (52000.0, 3700000.0, 0.0), ["Westing (m), ", "Southing (m)"]),
+        ("EPSG:5513", (1043000.0, 742000.0, 200.0), ["Westing (m), ", "Southing (m)"]),
+        ("EPSG:27700", (351139.0, 512875.0, 0.0), ["Easting (m), ", "Northing (m)"]),
+    ],
+)
+def test_axes_are_called_by_the_directions_in_which_they_count(crs, origin, titles):
+    frame = LocalFrame.at(crs, origin)
+    found = findings(georeference=located(frame))
+    texts = Reader(str(draw_map(found, measure(found)))).text
+    assert all(any(text.startswith(title) for text in texts) for title in titles)
+    x, y = (spaced(round(value, -2)) for value in sorted(frame.to_crs(np.array([[40.0, 30, 0]]))[0, :2].tolist()))
+    assert {x, y} <= set(texts)
 
 
 @pytest.mark.parametrize(("sees_falloff", "after"), [(True, 6.0), (False, 7.0)])

@@ -1,5 +1,6 @@
 """Statistics of a survey against closed forms."""
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -169,6 +170,38 @@ def test_the_order_of_the_flight_is_of_time_and_of_names_where_times_are_missing
     read[0] = replace(read[0], time_s=float("nan"))
     by_name = measure(findings(position, survey=Survey(read[0].path, tuple(read), None)))
     assert by_name.order.tolist() == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize("of", ["drones", "rig"])
+def test_what_is_flown_at_once_are_two_flights(of):
+    """Two drones on fields side by side, and two cameras of a rig, which take turns by a second."""
+    one = flight()
+    position = np.concatenate([one, one + (np.array([0, 3 * ASIDE, 0]) if of == "drones" else np.array([0.2, 0, 0]))])
+    read = [photograph(i, place) for i, place in enumerate(position)]
+    read[18:] = [replace(p, serial="second", time_s=read[i].time_s + 1) for i, p in enumerate(read[18:])]
+    found = measure(findings(position, survey=Survey(read[0].path, tuple(read), None)))
+    assert [own.tolist() for own in found.flights] == [[*range(18)], [*range(18, 36)]]
+    np.testing.assert_allclose(found.forward_overlap, 1 - AHEAD / FOOTPRINT[0], atol=0.01)
+    np.testing.assert_allclose(found.side_overlap, 1 - ASIDE / FOOTPRINT[1], atol=0.01)
+
+
+def test_folders_of_one_card_are_one_flight():
+    names = [f"{100 + i // 4}MEDIA/{i:02d}.JPG" for i in range(12)]
+    found = measure(findings(flight(2, 6), names))
+    assert [own.tolist() for own in found.flights] == [[*range(12)]]
+
+
+def test_a_block_is_read_in_little_more_memory_than_it_has():
+    position = flight(4, 10)
+    model = reconstruction(position, flat_ground(position, a_photograph=200))
+    read_block(model, level=False)
+    tracemalloc.start()
+    try:
+        block = read_block(model, level=False)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 2.5 * sum(values.nbytes for values in vars(block).values() if isinstance(values, np.ndarray))
 
 
 def test_the_originals_resolution_counts_their_own_pixels(flat):

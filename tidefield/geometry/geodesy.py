@@ -20,7 +20,7 @@ import warnings
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 from jaxtyping import Float64
@@ -46,6 +46,7 @@ _NAMELESS = ("unknown", "unnamed", "undefined", "unspecified", "not specified")
 _IN_FEET = re.compile(r" \(ft\w*\)$")
 _ORIGIN = ("longitude_deg", "latitude_deg", "height_m")
 Points: TypeAlias = Float64[np.ndarray, "N 3"]
+_Degrees = TypeVar("_Degrees", float, np.ndarray)
 
 
 @dataclass(frozen=True)
@@ -171,11 +172,11 @@ class LocalFrame:
 
     @cached_property
     def _projection(self) -> Transformer:
-        return _transformer(self._base, self._datum)
+        return transformer(self._base, self._datum)
 
     @cached_property
     def _wgs84(self) -> Transformer:
-        return _transformer(horizontal(self._crs), parse_crs(WGS84))
+        return transformer(horizontal(self._crs), parse_crs(WGS84))
 
     @cached_property
     def _degrees(self) -> Float64[np.ndarray, " 3"]:
@@ -202,11 +203,11 @@ class LocalFrame:
         points = coordinates * np.array([1.0, 1.0, metres_per_height(system)])
         if datum is not None and datum.to_2d() == self._datum:
             if base.is_projected:
-                points = self._transform(_transformer(base, self._datum), points)
+                points = self._transform(transformer(base, self._datum), points)
         else:
             # By way of the projected system as given, because its definition may hold its own shift to WGS 84.
             height_m = points[:, 2].copy()
-            shift = _transformer(horizontal(system), horizontal(self._crs))
+            shift = transformer(horizontal(system), horizontal(self._crs))
             points = self._transform(self._projection, self._transform(shift, points))
             points[:, 2] = height_m
         return points * self._degrees
@@ -224,7 +225,7 @@ class LocalFrame:
 
 
 @lru_cache
-def _transformer(source: CRS, target: CRS) -> Transformer:
+def transformer(source: CRS, target: CRS) -> Transformer:
     """The transformation of coordinates, longitude or easting first; PROJ takes milliseconds to find one."""
     return Transformer.from_crs(source, target, always_xy=True)
 
@@ -248,6 +249,11 @@ def parse_crs(text: str) -> CRS:
     except ProjError as error:
         raise ValueError(f"{text!r} ({crs.name}) cannot be transformed to WGS 84") from error
     return crs
+
+
+def near_longitude(degrees: _Degrees, reference: float) -> _Degrees:
+    """Turn longitudes by whole circles to within 180 degrees of another, so that they continue across the date line."""
+    return degrees + 360 * np.rint((reference - degrees) / 360)
 
 
 def metres_per_degree(latitude_deg: float) -> tuple[float, float]:

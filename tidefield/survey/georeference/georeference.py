@@ -11,6 +11,7 @@ import pycolmap
 from jaxtyping import Float64
 
 from tidefield.data.georeference import Georeference, Residuals
+from tidefield.errors import list_names
 from tidefield.geometry.geodesy import LocalFrame, parse_crs
 from tidefield.geometry.similarity import Similarity, level
 from tidefield.survey.georeference.bundle_adjustment import adjust_to_positions, differential, hold_to_positions
@@ -77,6 +78,8 @@ def georeference(model: pycolmap.Reconstruction, survey: Survey, progress: Progr
         found = adjust_to_control(model, marks, agree, progress, fit if shaped else None)
         residuals, check, left_out = found.residuals, found.check, (*gross_errors, *unplaced, *found.rejected)
         last, notes, used = found.moved @ last, (*notes, *shape, *found.notes), found.used_world
+        if fit is None and positions.names:
+            notes += (f"The positions of {list_names(positions.names)} are not used: {_why_unused(positions)}.",)
     elif fit is None:
         return _level_only(model, photographs, positions)
     else:
@@ -90,7 +93,7 @@ def georeference(model: pycolmap.Reconstruction, survey: Survey, progress: Progr
         frame=frame,
         source="GPS" if control is None else "ground control",
         world_from_model=last @ world_from_model,
-        gps=_gps_residuals(model, positions, frame),
+        gps=_gps_residuals(model, positions, frame) if fit else Residuals(),
         control=residuals,
         check=check,
         left_out=left_out,
@@ -110,16 +113,16 @@ def _level_only(
     _transform(model, similarity)
     count = sum(photograph.position is not None for photograph in photographs)
     found = f"{count} photographs have positions" if count else "No photograph has a position"
-    reason, before, after = "three are needed", (), ()
+    before, after = (), ()
     if len(positions.names) >= 3:
-        reason, before = "they do not follow the photographs", positions.notes
+        before = positions.notes
         after = (
             "Check the positions, and in a file of positions its names and the order of its coordinates; or name "
             "another file with --gps.",
         )
     note = (
-        f"{found}, and {reason}: the scene is not georeferenced. Its scale is the model's own and not metres; its "
-        f"vertical is from {down.source}, its north is arbitrary."
+        f"{found}, and {_why_unused(positions)}: the scene is not georeferenced. Its scale is the model's own and not "
+        f"metres; its vertical is from {down.source}, its north is arbitrary."
     )
     return Georeference(
         frame=None,
@@ -133,10 +136,12 @@ def _level_only(
     )
 
 
+def _why_unused(positions: GivenPositions) -> str:
+    return "three are needed" if len(positions.names) < 3 else "they do not follow the photographs"
+
+
 def _gps_residuals(model: pycolmap.Reconstruction, positions: GivenPositions, frame: LocalFrame) -> Residuals:
     """Compute the residuals of all positions, for a model in the world."""
-    if not positions.names:
-        return Residuals()
     centres = camera_centres(model)
     found = np.array([centres[name] for name in positions.names])
     error_m = found - frame.from_geographic(positions.longitude_latitude_height)

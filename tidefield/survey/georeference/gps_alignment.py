@@ -13,9 +13,9 @@ from jaxtyping import Bool, Float64
 
 from tidefield.data.georeference import LeftOut
 from tidefield.errors import SurveyError
-from tidefield.geometry.geodesy import WGS84, LocalFrame, metres_per_degree
+from tidefield.geometry.geodesy import WGS84, LocalFrame, metres_per_degree, near_longitude
 from tidefield.geometry.similarity import Similarity, hypotheses, least_median, outliers, refine_similarity
-from tidefield.survey.io.positions import radius_m
+from tidefield.survey.io.positions import degrees_of, radius_m
 from tidefield.survey.survey import Photograph, Position
 
 DIFFERENTIAL_M = 0.3
@@ -120,11 +120,9 @@ def given_positions(photographs: Sequence[Photograph]) -> GivenPositions:
             )
     if without:
         notes.append(f"{without} of {count} positions are not used: they have no height, unlike the others.")
-    degrees = np.array([(p.longitude_deg, p.latitude_deg) for _, p in located], dtype=np.float64).reshape(-1, 2)
     vertical_m = [position.vertical_m if located is absolute else math.nan for _, position in located]
     stated = [(position.horizontal_m, vertical) for (_, position), vertical in zip(located, vertical_m, strict=True)]
-    if len(degrees):  # all on one side of the date line
-        degrees[:, 0] = (degrees[:, 0] - degrees[0, 0] + 180) % 360 - 180 + degrees[0, 0]
+    degrees = degrees_of([photograph for photograph, _ in located])
     return GivenPositions(
         names=tuple(photograph.name for photograph, _ in located),
         longitude_latitude_height=np.column_stack([degrees, np.array(heights, dtype=np.float64)]),
@@ -159,7 +157,7 @@ def _breadths_m(positions: Sequence[Position]) -> Float64[np.ndarray, " 2"]:
     if len(positions) < 2:
         return np.zeros(2)
     degrees = np.array([(p.longitude_deg, p.latitude_deg) for p in positions])
-    degrees[:, 0] = (degrees[:, 0] - degrees[0, 0] + 180) % 360 - 180
+    degrees[:, 0] = near_longitude(degrees[:, 0], degrees[0, 0])
     return np.sqrt(np.maximum(0.0, np.linalg.eigvalsh(np.cov((degrees * metres_per_degree(degrees[0, 1])).T))))
 
 

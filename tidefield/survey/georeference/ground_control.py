@@ -143,11 +143,12 @@ def locate_marks(
     names = sorted(control.points)
     coordinates = frame.from_system(control.crs, np.array([control.points[name] for name in names], dtype=np.float64))
     world = dict(zip(names, coordinates, strict=True))
-    found = [mark for mark in control.marks if mark.photograph in images and mark.photograph in sizes]
+    placed = images.keys() & sizes
+    found = [mark for mark in control.marks if mark.photograph in placed]
     left_out = tuple(
         LeftOut("mark", f"{mark.point} in {mark.photograph}", "the photograph could not be placed, or is not there")
         for mark in control.marks
-        if mark not in found
+        if mark.photograph not in placed
     )
     if not found:
         raise SurveyError(
@@ -282,7 +283,7 @@ def fit_control(
         )
     source, target = _pairs(model, marks.where(agree))
     sigma = np.full_like(target, _CONTROL_M)
-    if not (shaped and positions is not None) and not _are_collinear(target):
+    if not (shaped and positions is not None) and not are_collinear(target):
         similarity = refine_similarity(similarity, source, target, sigma).similarity
     elif positions is not None:
         _require_a_place(source, marks.where(agree), shaped)
@@ -296,7 +297,7 @@ def fit_control(
 def _require_a_place(source: Float64[np.ndarray, "N 3"], marks: Marks, shaped: bool) -> None:
     """Raise an error where marks move nothing: no point is in the model, and too few are to be adjusted to."""
     names = list(marks.points)
-    if len(source) == 0 and (shaped or _are_collinear(marks.points.values())):
+    if len(source) == 0 and (shaped or are_collinear(marks.points.values())):
         raise SurveyError(
             f"no point of ground control ({list_names(names)}) has two marks that fit together, and one mark does not "
             "place a point in the model: expected marks of a point in two photographs; mark each point in two or more, "
@@ -304,7 +305,7 @@ def _require_a_place(source: Float64[np.ndarray, "N 3"], marks: Marks, shaped: b
         )
 
 
-def _are_collinear(points: Collection[Float64[np.ndarray, " 3"]]) -> bool:
+def are_collinear(points: Collection[Float64[np.ndarray, " 3"]]) -> bool:
     """Test whether points leave a rotation undetermined: fewer than three, or on one line."""
     if len(points) < 3:
         return True
@@ -359,7 +360,7 @@ def adjust_to_control(
         agree: the marks to start with.
         shaped_by: the positions that the model was adjusted to, as they are in the world; None if it was to none.
     """
-    if _are_collinear(marks.where(agree).points.values()):
+    if are_collinear(marks.where(agree).points.values()):
         note = (
             "Fewer than three control points can be used, or they lie on one line: the photographs were aligned with "
             "them without adjustment, and cannot be checked."
@@ -497,7 +498,7 @@ def _cross_validate(model: pycolmap.Reconstruction, marks: Marks, free_lens: boo
     for done, fold in enumerate(folds):
         progress(done, len(folds))
         rest = marks.where(~marks.of(*fold))
-        if _are_collinear(rest.points.values()):
+        if are_collinear(rest.points.values()):
             continue
         adjusted = _adjusted(light, rest, free_lens)
         for name in fold:
@@ -527,7 +528,7 @@ def _consistent(
         found = allowed & (share < max(_MARK_TOLERANCE, 5 * 1.4826 * float(np.median(share[agree]))))
         # Where most of a point's marks disagree, those that agree do so by chance.
         found &= ~marks.of(*(n for n in marks.points if 2 * (found & marks.of(n)).sum() < marks.of(n).sum()))
-        if (found == agree).all() or _are_collinear(marks.where(found).points.values()):
+        if (found == agree).all() or are_collinear(marks.where(found).points.values()):
             break
         agree = found
     return agree

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
-from pyproj import CRS, Geod, Transformer
+from pyproj import CRS, Geod
 from pyproj.aoi import AreaOfInterest
 from pyproj.database import query_crs_info
 from pyproj.enums import PJType
@@ -22,7 +22,7 @@ from pyproj.exceptions import CRSError, ProjError
 
 from tidefield.errors import SurveyError, list_names
 from tidefield.files import write_text
-from tidefield.geometry.geodesy import WGS84, metres_per_degree, parse_crs
+from tidefield.geometry.geodesy import WGS84, horizontal, metres_per_degree, near_longitude, parse_crs, transformer
 from tidefield.survey.io.image_decoding import upright_size, upright_uv
 from tidefield.survey.io.positions import degrees_of, radius_m
 from tidefield.survey.io.text_files import PhotographNames, leading_numbers, read_list, unit_remarks
@@ -176,7 +176,7 @@ def refuse_elsewhere(control: Control, longitude_deg: float, latitude_deg: float
     """
     points = np.array(list(control.points.values()), dtype=np.float64)
     x, y = np.median(points[:, 0]), np.median(points[:, 1])
-    longitude_deg = (longitude_deg + 180) % 360 - 180
+    longitude_deg = float(near_longitude(longitude_deg, 0.0))
     site = longitude_deg, latitude_deg
     away = _distance_m(parse_crs(control.crs), x, y, site)
     if away < MAX_DISTANCE_M + radius_m:
@@ -213,11 +213,17 @@ def _mirrored(crs: str, x: float, y: float, site: tuple[float, float], radius_m:
 
 
 def _fitting(crs: str, x: float, y: float, site: tuple[float, float]) -> list[str]:
-    """Names of the systems, of those in use at a site and WGS 84, in which the coordinates are at it; nearest first."""
+    """Names of the systems, of those in use at a site and WGS 84, in which the coordinates are at it.
+
+    Zones of several datums lie a few hundred metres apart: those of WGS 84 and ETRS89, which receivers use, come first.
+    Nobody uses WGS 72 any more.
+    """
     area = AreaOfInterest(*site, *site)
     used = query_crs_info(auth_name="EPSG", pj_types=PJType.PROJECTED_CRS, area_of_interest=area, contains=True)
     # Systems with northing first are duplicates here, because x is always easting.
-    systems = {f"EPSG:{i.code} ({i.name})": f"EPSG:{i.code}" for i in used if "(N-E)" not in i.name}
+    systems = {
+        f"EPSG:{i.code} ({i.name})": f"EPSG:{i.code}" for i in used if not ("(N-E)" in i.name or "WGS 72" in i.name)
+    }
     systems[f"{WGS84} (longitude and latitude)"] = WGS84
     if f"EPSG:{parse_crs(crs).to_epsg()}" not in systems.values():
         systems[parse_crs(crs).name] = crs
@@ -225,9 +231,13 @@ def _fitting(crs: str, x: float, y: float, site: tuple[float, float]) -> list[st
         away = {
             name + order: _distance_m(CRS.from_user_input(text), first, second, site) for name, text in systems.items()
         }
-        near = sorted((name for name in away if away[name] < _FITTING_M), key=lambda name: away[name])
-        if near:
-            return near[:_MAX_SUGGESTIONS]
+        rank = {
+            name: (round(metres / 1000), not ("WGS 84" in name or "ETRS89" in name), metres)
+            for name, metres in away.items()
+            if metres < _FITTING_M
+        }
+        if rank:
+            return sorted(rank, key=rank.__getitem__)[:_MAX_SUGGESTIONS]
     return []
 
 
@@ -242,7 +252,7 @@ def _distance_m(crs: CRS, x: float, y: float, site: tuple[float, float]) -> floa
 def _degrees(crs: CRS, x: Float64[np.ndarray, " N"], y: Float64[np.ndarray, " N"]) -> Float64[np.ndarray, "N 2"]:
     """Longitudes and latitudes (WGS 84); infinite outside of the system's domain."""
     try:
-        there = np.stack(Transformer.from_crs(crs.to_2d(), WGS84, always_xy=True).transform(x, y), axis=1)
+        there = np.stack(transformer(horizontal(crs), parse_crs(WGS84)).transform(x, y), axis=1)
     except (ProjError, CRSError):
         return np.full((len(x), 2), math.inf)
     there[~(np.isfinite(there).all(axis=1) & (np.abs(there[:, 1]) <= 90))] = math.inf

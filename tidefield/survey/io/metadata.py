@@ -12,7 +12,7 @@ from defusedxml.ElementTree import fromstring
 from PIL import ExifTags, Image
 
 from tidefield.data.exif import Exif, as_number, read_exif
-from tidefield.geometry.geodesy import metres_per_degree
+from tidefield.geometry.geodesy import metres_per_degree, near_longitude
 from tidefield.survey.survey import Position, VerticalDatum
 
 _XMP_TAG = 700
@@ -23,9 +23,10 @@ CORRECTED_M = 0.5
 ROUNDING_M = 0.015
 """What a drone writes into EXIF and into XMP differs by less: by 1 cm in brighton_beach and turin_lot."""
 _LOWEST_M, _HIGHEST_M = -500.0, 9000.0  # the Dead Sea, and Mount Everest
-# Pix4D's namespace counts a camera's pitch from straight down, the others from the horizon (as opendm/photo.py of
-# OpenDroneMap also has it). Some makers may not follow it, so no photograph is left out for its pitch alone.
-_NADIR_FROM_HORIZON_DEG = -90.0
+# Pix4D's namespace has the angles of a body with the camera beneath it, the others those of a gimbal (as
+# opendm/photo.py of OpenDroneMap also has it). Some makers may not follow it, so no photograph is left out for its
+# pitch alone.
+_ROLLS_TO_THE_LEFT = ("sensefly",)  # makers that count the roll the other way, by the same source
 
 _RDF = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}"
 _PIX4D = "http://pix4d.com/camera/1.0"
@@ -89,7 +90,9 @@ class PhotographMetadata:
             if math.isfinite(yaw + pitch + roll) and any((yaw, pitch, roll)):
                 return yaw, pitch, roll
         yaw, pitch, roll = (self.xmp_number(f"Camera:{name}") for name in ("Yaw", "Pitch", "Roll"))
-        return (yaw, pitch + _NADIR_FROM_HORIZON_DEG, roll) if math.isfinite(yaw + pitch + roll) else None
+        if self.text(ExifTags.Base.Make, "Make").casefold() in _ROLLS_TO_THE_LEFT:
+            roll = -roll
+        return gimbal_of_body(yaw, pitch, roll) if math.isfinite(yaw + pitch + roll) else None
 
     @property
     def correction_m(self) -> float:
@@ -98,7 +101,7 @@ class PhotographMetadata:
         if not math.isfinite(latitude + longitude):
             return 0.0
         east, north = metres_per_degree(latitude)
-        turned = (longitude - own[1] + 180) % 360 - 180
+        turned = near_longitude(longitude, own[1]) - own[1]
         plan_m = math.hypot(north * (latitude - own[0]), east * turned)
         height_m, own_m = _exif_height_m(self), self.xmp_number("AbsoluteAltitude")
         up_m = abs(height_m - own_m) if _is_plausible(height_m, own_m) else 0.0
@@ -153,6 +156,25 @@ class PhotographMetadata:
         )
         height_m, datum = _height(self, rtk, corrected)
         return Position(latitude, longitude, height_m, horizontal_m, vertical_m, datum, source)
+
+
+def gimbal_of_body(yaw_deg: float, pitch_deg: float, roll_deg: float) -> tuple[float, float, float]:
+    """Convert the angles of a body, beneath which a camera looks straight down, to those of a gimbal.
+
+    Args:
+        yaw_deg: of the body, clockwise from north; the top of the photograph is ahead.
+        pitch_deg: positive where its nose is up, so that the camera looks ahead.
+        roll_deg: positive where its right side is down, so that the camera looks to the left.
+
+    Returns:
+        Yaw, pitch (-90 looks straight down) and roll of the camera, whose axes point as the body's would.
+    """
+    pitch, roll = math.radians(pitch_deg), math.radians(roll_deg)
+    # Where the camera looks ahead and to the right of the body, and which way is down in its picture.
+    turned = math.atan2(-math.sin(roll), math.sin(pitch) * math.cos(roll))
+    tilt = math.atan2(math.cos(pitch) * math.sin(roll), math.sin(pitch))
+    down = -math.asin(math.cos(pitch) * math.cos(roll))
+    return yaw_deg + math.degrees(turned), math.degrees(down), math.degrees(tilt)
 
 
 def read_metadata(image: Image.Image) -> PhotographMetadata:

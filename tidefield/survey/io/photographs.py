@@ -181,15 +181,20 @@ def _with_positions(read: Sequence[_Read]) -> list[Photograph]:
 
 def _flights(photographs: Sequence[Photograph]) -> list[Int64[np.ndarray, " K"]]:
     """The indices of the photographs of each camera and folder that have no long pause between them."""
-    by_camera = defaultdict(list)
-    for k, photograph in enumerate(photographs):
-        by_camera[photograph.camera, photograph.serial, photograph.name.rpartition("/")[0]].append(k)
     flights = []
-    for own in by_camera.values():
+    for own in by_camera(photographs):
         times_s = np.array([photographs[k].time_s for k in own])
         order = np.argsort(times_s)  # those without a time are last
         flights += np.split(np.array(own)[order], np.flatnonzero(np.diff(times_s[order]) > _PAUSE_S) + 1)
     return flights
+
+
+def by_camera(photographs: Sequence[Photograph]) -> list[list[int]]:
+    """The indices of the photographs of each camera in each folder."""
+    found = defaultdict(list)
+    for k, photograph in enumerate(photographs):
+        found[photograph.camera, photograph.serial, photograph.name.rpartition("/")[0]].append(k)
+    return list(found.values())
 
 
 def control_remark(error: SurveyError) -> str:

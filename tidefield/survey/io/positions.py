@@ -13,7 +13,7 @@ from typing import TypeAlias
 
 import numpy as np
 from jaxtyping import Float64
-from pyproj import CRS, Transformer
+from pyproj import CRS
 
 from tidefield.errors import SurveyError, list_names
 from tidefield.geometry.geodesy import (
@@ -25,8 +25,11 @@ from tidefield.geometry.geodesy import (
     lost_in_conversion,
     metres_per_degree,
     metres_per_height,
+    near_longitude,
     parse_crs,
+    transformer,
 )
+from tidefield.survey.io.metadata import gimbal_of_body
 from tidefield.survey.io.text_files import (
     PhotographNames,
     find_file,
@@ -63,6 +66,7 @@ _COLUMNS = {
     "pitch": ("pitch",),
     "roll": ("roll",),
 }
+_HEMISPHERES = {"latitude": {"N", "S", "NORTH", "SOUTH"}, "longitude": {"E", "W", "EAST", "WEST"}}
 _LENGTHS = ("height", "horizontal", "vertical")
 _ANGLES = ("yaw", "pitch", "roll")
 _DATUMS: dict[str, VerticalDatum] = {
@@ -224,13 +228,15 @@ def _columns(header: str) -> tuple[dict[str, tuple[int, float]], str]:
     """Column of a table by its meaning, with the length of its unit in metres, and the separator of the columns."""
     separator = max(",;\t", key=header.count)
     found: dict[str, tuple[int, float]] = {}
+    letters: dict[str, tuple[int, float]] = {}  # x, y and z may be those of a grid, next to latitude and longitude
     for index, title in enumerate(header.casefold().split(separator)):
         title = title[:_MAX_TITLE]
         parts = [_words(part) for part in _BRACKETS.sub("", title).split("/")]  # Metashape has "X/Longitude"
         meaning = next((key for key in _COLUMNS if any(_means(part, key) for part in parts)), None)
         if meaning is not None:
-            found.setdefault(meaning, (index, _unit_m(title) if meaning in _LENGTHS else 1.0))
-    return found, separator
+            of = letters if max(len(word) for part in parts for word in part) == 1 else found
+            of.setdefault(meaning, (index, _unit_m(title) if meaning in _LENGTHS else 1.0))
+    return letters | found, separator
 
 
 def _words(title: str) -> list[str]:
@@ -261,32 +267,32 @@ def _read_table(
     system = system or usual
     remarks = [f"{path.name}: positions are in {system.name}, as its first line has it."] if other else []
     titles = [title.strip()[:_MAX_TITLE] for title in lines[header].split(separator)]
-    hemispheres = _hemispheres(titles)
     above = _words(titles[columns["height"][0]].casefold()) if "height" in columns else []
     datums: list[VerticalDatum] = [*(_DATUMS[word] for word in above if word in _DATUMS), _datum(system)]
     height_unit_m = 1.0 if {*above} & {*_UNITS_M} else metres_per_height(system)
-    read: list[_Row] = []
-    rows: list[list[str]] = []
+    found_rows: list[tuple[str, str, list[str]]] = []
     for number, row in _rows(path, lines, header, separator):
         if not any(cell.strip() for cell in row) or row[0].startswith("#"):
             continue
-        cells = {key: row[index].strip() if index < len(row) else "" for key, (index, _) in columns.items()}
-        name = names.find(cells["name"])
-        if name is None:
-            continue
-        rows.append(row)
-        where = f"{path}, line {number}"
+        row = [cell.strip() for cell in row] + [""] * (len(titles) - len(row))
+        if name := names.find(row[columns["name"][0]]):
+            found_rows.append((name, f"{path}, line {number}", row))
+    rows = [row for _, _, row in found_rows]
+    unread = sorted({*range(len(titles))} - {index for index, _ in columns.values()})
+    hemispheres = _hemispheres(rows, unread)
+    read: list[_Row] = []
+    for name, where, row in found_rows:
         numbers = {}
-        for key, (_, unit_m) in columns.items():
+        for key, (index, unit_m) in columns.items():
             if key == "name":
                 continue
             # A table separated by semicolons may have decimal commas. An empty cell is unknown.
-            number = leading_numbers([cells[key].replace(",", ".") or "nan"])
+            number = leading_numbers([row[index].replace(",", ".") or "nan"])
             if not number:
-                raise SurveyError(f"{where} has {cells[key][:40]!r}: expected a number; correct it")
+                raise SurveyError(f"{where} has {row[index][:40]!r}: expected a number; correct it")
             numbers[key] = number[0] * unit_m
         for key, index in hemispheres.items():
-            if index < len(row) and row[index].strip()[:1].upper() in ("S", "W"):
+            if row[index][:1].upper() in ("S", "W"):
                 numbers[key] = -abs(numbers[key])
         degrees = numbers["latitude"], numbers["longitude"]
         if not all(map(math.isfinite, degrees)):
@@ -300,8 +306,7 @@ def _read_table(
         read.append((name, where, values))
     found = _records(path, read, system, datums[0])
     remarks += _conversion_remarks(path, system) if other else []
-    unread = {*range(len(titles))} - {index for index, _ in columns.values()} - {*hemispheres.values()}
-    numeric = [titles[index] for index in sorted(unread) if _is_numeric(rows, index)]
+    numeric = [titles[index] for index in unread if _is_numeric(rows, index)]
     accuracies = [title for title in numeric if {*_words(title.casefold())} & {*_OF_ACCURACIES}]
     if accuracies and not {"horizontal", "vertical"} <= {*columns}:
         remarks.append(
@@ -318,18 +323,20 @@ def _read_table(
     ]
 
 
-def _hemispheres(titles: Sequence[str]) -> dict[str, int]:
-    """Columns of the letters N, S, E and W, as exiftool calls those of EXIF: GPSLatitudeRef and GPSLongitudeRef."""
-    plain = ["".join(filter(str.isalnum, title.casefold())) for title in titles]
-    pairs = (
-        (key, k) for key in ("latitude", "longitude") for k, title in enumerate(plain) if title.endswith(f"{key}ref")
-    )
-    return dict(pairs)
+def _hemispheres(rows: Sequence[Sequence[str]], columns: Iterable[int]) -> dict[str, int]:
+    """The first columns that have nothing but the hemispheres of latitudes and of longitudes, whatever their titles."""
+    found: dict[str, int] = {}
+    for index in columns:
+        cells = {row[index].upper() for row in rows} - {""}
+        for key, names in _HEMISPHERES.items():
+            if cells and cells <= names:
+                found.setdefault(key, index)
+    return found
 
 
 def _is_numeric(rows: Sequence[Sequence[str]], index: int) -> bool:
     """Whether a column has numbers, and nothing else."""
-    cells = [row[index].strip().replace(",", ".") for row in rows if index < len(row)]
+    cells = [row[index].replace(",", ".") for row in rows]
     return any(cells) and all(leading_numbers([cell]) for cell in cells if cell)
 
 
@@ -382,23 +389,22 @@ def _records(path: Path, read: Sequence[_Row], system: CRS, datum: VerticalDatum
     """Records by name of the photograph, of rows in a system, with heights in metres."""
     if not read:
         return {}
-    to_degrees = Transformer.from_crs(horizontal(system), WGS84, always_xy=True)
+    to_degrees = transformer(horizontal(system), parse_crs(WGS84))
     degrees = np.column_stack(to_degrees.transform(*np.array([values[:2] for _, _, values in read]).T))
     given: dict[str, list[float]] = {}
     found: dict[str, GpsRecord] = {}
     for (name, where, values), (longitude, latitude) in zip(read, degrees.tolist(), strict=True):
-        if abs(longitude) > 180:
-            longitude = (longitude + 180) % 360 - 180
         if not math.isfinite(latitude):
             raise SurveyError(f"{where} gives {values[:2]}: expected coordinates in {system.srs!r}; correct either")
+        longitude = float(near_longitude(longitude, 0.0))
         if not np.array_equal(given.setdefault(name, values), values, equal_nan=True):
             raise _Contradiction(
                 f"{where} gives {name} a second position: expected one line per photograph; remove one"
             )
         height, yaw, pitch, roll, across, up = values[2:]
-        # ODM counts the pitch from straight down; three zeros stand for angles that are not available.
+        # ODM's angles are a body's; three zeros stand for angles that are not available.
         is_turned = math.isfinite(yaw + pitch + roll) and any((yaw, pitch, roll))
-        gimbal = (yaw, pitch - 90.0, roll) if is_turned else None
+        gimbal = gimbal_of_body(yaw, pitch, roll) if is_turned else None
         position = Position(latitude, longitude, height, *_positive(across, up), datum, path.name)
         found[name] = GpsRecord(position, gimbal)
     return found
@@ -500,7 +506,7 @@ def degrees_of(photographs: Sequence[Photograph]) -> Float64[np.ndarray, "V 2"]:
     ).reshape(-1, 2)
     known = degrees[np.isfinite(degrees[:, 0]), 0]
     if len(known):
-        degrees[:, 0] = (degrees[:, 0] - known[0] + 180) % 360 - 180 + known[0]
+        degrees[:, 0] = near_longitude(degrees[:, 0], known[0])
     return degrees
 
 

@@ -21,7 +21,7 @@ from scipy.spatial import KDTree
 
 from tidefield.errors import SurveyError
 from tidefield.machine import cores
-from tidefield.survey.io.image_decoding import thumbnail
+from tidefield.survey.io.image_decoding import thumbnail, used_pixels
 from tidefield.survey.io.photographs import FEWEST
 from tidefield.survey.io.positions import positions_m
 from tidefield.survey.quality.measures import SIDE_PX, Measures, measure
@@ -31,7 +31,9 @@ NEIGHBOURS = 6
 """Number of photographs, the nearest in position or else in time, with which one is compared."""
 
 FLAT_CONTRAST = 10.0
-DARK_HIGHLIGHTS = 60.0
+# At 1% of the light, lit ground has a contrast of 12 to 18, and no matches; wet mud at dusk, which is as dark as lit
+# ground at 8%, matches from 20 on.
+DARK_HIGHLIGHTS, DARK_CONTRAST = 60.0, 20.0
 DIM_HIGHLIGHTS, DIM_LIGHT = 80.0, 0.15  # of the light of the neighbours
 WHITE = 0.2
 GLARING_CLIPPED, GLARING_LIGHT = 0.2, 3.5  # times the light of the neighbours
@@ -41,6 +43,8 @@ SOFT, SOFT_OF_NEIGHBOURS, SOFT_OF_SURVEY = 0.11, 0.65, 0.7
 SOFTER_OF_NEIGHBOURS, SOFTER_OF_SURVEY = 0.4, 0.35
 HOPELESSLY_SOFT = 0.035
 SKY, SKY_BELOW_HORIZON, SKY_AT_LEAST = 0.35, 0.3, 0.1
+SKIES = 2
+"""Of the neighbours: where so many have a sky, too, it is smooth water or mud, or the survey is oblique."""
 
 GAP_SPACINGS = 6.0
 """A distance is a gap in the survey from this multiple of the median distance between neighbours ..."""
@@ -92,6 +96,9 @@ def assess_quality(survey: Survey, progress: Progress | None = None) -> tuple[Qu
     """Decide on all photographs, in their order.
 
     Decodes one reduced image per processor at a time; about 20 kB of each are kept until the end.
+
+    Raises:
+        SceneError: a mask is damaged.
     """
     photographs = survey.photographs
     measured, outlines, reasons = _measure(photographs, progress)
@@ -107,8 +114,9 @@ def assess_quality(survey: Survey, progress: Progress | None = None) -> tuple[Qu
     for index, measures in enumerate(measured):
         if measures is not None and reasons[index] is None:
             of_neighbours = _median([sharp[i] for i in near[index]])
+            skies = sum(other.sky > SKY for other in (measured[i] for i in near[index]) if other is not None)
             reasons[index] = _blurred(sharp[index], of_kind[kinds[index]], of_neighbours) or _horizon(
-                photographs[index], measures
+                photographs[index], measures.sky, skies
             )
     for index, reason in {**find_beyond_gap(photographs), **_low(photographs)}.items():
         reasons[index] = reasons[index] or reason
@@ -162,7 +170,9 @@ def _measure(
 
     def measure_one(photograph: Photograph) -> tuple[Measures | None, np.ndarray, str | None]:
         try:
-            measures, small = measure(thumbnail(photograph, SIDE_PX))
+            pixels = thumbnail(photograph, SIDE_PX)
+            is_whole = photograph.mask is None and not photograph.has_alpha
+            measures, small = measure(pixels, None if is_whole else used_pixels(photograph))
         except SurveyError as error:
             return None, np.zeros((16, 16), np.int8), f"undecodable: {error}"
         return measures, _outline(small), None
@@ -210,10 +220,10 @@ def _flat_or_badly_exposed(measures: Measures, neighbours: Sequence[Measures]) -
         )
     if measures.white > WHITE:
         return f"over-exposed: {measures.white:.0%} of it is white; {WHITE:.0%} is the limit."
-    if measures.highlights < DARK_HIGHLIGHTS:
+    if measures.highlights < DARK_HIGHLIGHTS and measures.contrast < DARK_CONTRAST:
         return (
-            f"under-exposed: 95% of it is darker than level {measures.highlights:.0f} of 255; "
-            f"{DARK_HIGHLIGHTS:.0f} is the limit."
+            f"under-exposed: 95% of it is darker than level {measures.highlights:.0f} of 255, and 98% lies within "
+            f"{measures.contrast:.0f} levels; {DARK_HIGHLIGHTS:.0f} and {DARK_CONTRAST:.0f} are the limits."
         )
     usual = _median([other.light for other in neighbours])
     if measures.clipped > GLARING_CLIPPED and usual > 0 and measures.light > GLARING_LIGHT * usual:
@@ -247,18 +257,23 @@ def _blurred(sharpness: float, usual: float, of_neighbours: float) -> str | None
     return None
 
 
-def _horizon(photograph: Photograph, measures: Measures) -> str | None:
-    """Use the gimbal pitch where the image confirms it (makers define it differently), else the image alone."""
+def _horizon(photograph: Photograph, sky: float, skies: int) -> str | None:
+    """Use the gimbal pitch where the image confirms it (makers define it differently), else the image alone.
+
+    Args:
+        sky: share of the image.
+        skies: number of the neighbours whose image is as much of a sky.
+    """
     above = math.nan  # share of the image above the horizon, if the camera does not roll
     if photograph.gimbal_deg is not None:
         lens, pitch_deg = photograph.lens, min(89.0, max(-89.0, photograph.gimbal_deg[1]))
         focal_px = lens.focal_px if lens else _UNKNOWN_FOCAL * max(photograph.width, photograph.height)
         above = 0.5 + focal_px * math.tan(math.radians(pitch_deg)) / photograph.height
         above = min(1.0, max(0.0, above))
-    if above > SKY_BELOW_HORIZON and measures.sky > SKY_AT_LEAST:
+    if above > SKY_BELOW_HORIZON and sky > SKY_AT_LEAST:
         return f"horizon: {above:.0%} of it is above the horizon; {SKY_BELOW_HORIZON:.0%} is the limit."
-    if math.isnan(above) and measures.sky > SKY:
-        return f"horizon: {measures.sky:.0%} of it is sky; {SKY:.0%} is the limit."
+    if math.isnan(above) and sky > SKY and skies < SKIES:
+        return f"horizon: {sky:.0%} of it is sky; {SKY:.0%} is the limit."
     return None
 
 

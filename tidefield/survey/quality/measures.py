@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Bool, Float32, UInt8
 
 SIDE_PX = 1600
 """Longer side of the image that is measured; blur that is invisible at this size does not harm a scene."""
@@ -48,7 +48,7 @@ class Measures:
         clipped: share of pixels with at least one channel at its maximum.
         white: share of pixels with at least two channels at their maximum, which have no detail.
         contrast: between the 1st and the 99th percentile of the thumbnail, in which noise averages out.
-        sky: share of the image that is a smooth bright region along the whole upper edge.
+        sky: share of the image that is a smooth bright region along the whole upper edge; 0 if that is masked.
     """
 
     sharpness: float
@@ -61,16 +61,30 @@ class Measures:
     sky: float
 
 
-def measure(pixels: UInt8[np.ndarray, "H W 3"]) -> tuple[Measures, Float32[np.ndarray, "h w"]]:
-    """Measure an upright image of at most `SIDE_PX`; returns also its grey thumbnail of at most `THUMBNAIL_PX`."""
+def measure(
+    pixels: UInt8[np.ndarray, "H W 3"], used: Bool[np.ndarray, "_ _"] | None = None
+) -> tuple[Measures, Float32[np.ndarray, "h w"]]:
+    """Measure an upright image of at most `SIDE_PX`; returns also its grey thumbnail of at most `THUMBNAIL_PX`.
+
+    Args:
+        used: where the photograph is used, at any size; exposure and contrast are those of these pixels, or of all if
+            there are none. None is everywhere.
+    """
+
+    def of_used(values: np.ndarray) -> np.ndarray:
+        if used is None:
+            return values
+        share = cv2.resize(used * np.uint8(255), values.shape[1::-1], interpolation=cv2.INTER_AREA)
+        return values[share == 255] if share.max() == 255 else values
+
     grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
     scale = min(1.0, THUMBNAIL_PX / max(grey.shape))
     size = max(16, round(grey.shape[1] * scale)), max(16, round(grey.shape[0] * scale))
     thumbnail = cv2.resize(grey.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-    low, high = np.percentile(thumbnail, (1, 99))
-    median, highlights = np.percentile(grey, (50, 95))
+    low, high = np.percentile(of_used(thumbnail), (1, 99))
+    median, highlights = np.percentile(of_used(grey), (50, 95))
     value = float(median) / 255  # to linear light (IEC 61966-2-1)
-    clipped = (pixels >= _CLIPPED).sum(axis=-1, dtype=np.uint8)
+    clipped = (of_used(pixels) >= _CLIPPED).sum(axis=-1, dtype=np.uint8)
     measures = Measures(
         sharpness=sharpness(grey.astype(np.float32)),
         brightness=float(median),
@@ -79,7 +93,7 @@ def measure(pixels: UInt8[np.ndarray, "H W 3"]) -> tuple[Measures, Float32[np.nd
         clipped=float(np.mean(clipped >= 1)),
         white=float(np.mean(clipped >= 2)),
         contrast=float(high - low),
-        sky=_sky(thumbnail),
+        sky=_sky(thumbnail) if used is None or used[0].mean() >= _SKY_COLUMNS else 0.0,
     )
     return measures, thumbnail
 

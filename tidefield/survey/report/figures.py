@@ -25,9 +25,9 @@ from matplotlib.patches import Circle
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 from matplotlib.transforms import Affine2D
 
-from tidefield.geometry.geodesy import LocalFrame, parse_crs
+from tidefield.geometry.geodesy import LocalFrame, near_longitude, parse_crs
 from tidefield.survey.report.findings import Comparison, Findings
-from tidefield.survey.report.numbers import CLASSES, crs_title
+from tidefield.survey.report.numbers import CLASSES, crs_title, degrees
 from tidefield.survey.report.statistics import Statistics
 
 # A separate hue for ground in a single photograph, then pale to dark: distinct for colour-blind readers too.
@@ -321,13 +321,16 @@ def _annotate(axes: Axes, text: str, place: XY, above: bool = False) -> None:
 
 
 def _draw_flight(axes: Axes, statistics: Statistics) -> None:
-    """Draw lines through the cameras in the order of the flight, broken at long pauses, and arrows along them."""
-    order, position = statistics.order, statistics.block.position[:, :2]
-    pause = np.diff(np.array([photograph.time_s for photograph in statistics.photographs])[order])
-    timed = bool(np.isfinite(pause).all())
+    """Draw lines through the cameras in the order of each flight, broken at long pauses, and arrows along them."""
+    position = statistics.block.position[:, :2]
+    times = np.array([photograph.time_s for photograph in statistics.photographs])
+    timed = bool(np.isfinite(times).all())
     label = f"flight, in order of {'time' if timed else 'name'}"
-    breaks = np.flatnonzero(pause > LONG_PAUSE * np.median(pause)) + 1 if timed and len(pause) else []
-    parts = [position[part] for part in np.split(order, breaks)]
+    parts: list[Float64[np.ndarray, "K 2"]] = []
+    for order in statistics.flights:
+        pause = np.diff(times[order])
+        breaks = np.flatnonzero(pause > LONG_PAUSE * np.median(pause)) + 1 if timed and len(pause) else []
+        parts += [position[part] for part in np.split(order, breaks)]
     for part in parts:
         axes.plot(*part.T, color="white", alpha=0.75, linewidth=3, zorder=1.8)
         axes.plot(*part.T, color=INK, linewidth=1.1, zorder=1.8, label=label if part is parts[0] else "_")
@@ -344,7 +347,9 @@ def _draw_grid(axes: Axes, frame: LocalFrame | None, low: XY, high: XY) -> None:
     Over so little of the Earth, both are affine in x and y to less than a line's width.
     """
     grid = affine(low, high, frame.to_crs) if frame else np.eye(2, 3)
-    geographic = affine(low, high, frame.to_geographic) if frame else None
+    across = [0, 1] if abs(grid[0, 0]) >= abs(grid[0, 1]) else [1, 0]  # the axis that counts from west to east, or back
+    grid = grid[across]
+    geographic = _geographic(frame, low, high) if frame else None
     label_half = LABEL_HALF * float(high[0] - low[0]) / axes.bbox.width
 
     def label(where: Axis, axis: int, places: Float64[np.ndarray, " K"], labels: list[str]) -> None:
@@ -364,15 +369,26 @@ def _draw_grid(axes: Axes, frame: LocalFrame | None, low: XY, high: XY) -> None:
         if geographic is None:
             continue
         values, digits = coordinates(geographic, low, high, axis, 4)
-        texts = [f"{abs(value):.{digits}f}° {('EW', 'NS')[axis][bool(value < 0)]}" for value in values]
+        texts = [
+            f"{abs(value):.{digits}f}° {('EW', 'NS')[axis][bool(value < 0)]}" for value in near_longitude(values, 0.0)
+        ]
         other = axes.secondary_yaxis("right").yaxis if axis else axes.secondary_xaxis("top").xaxis
         other.set_tick_params(length=4, color=INK, pad=2, labelcolor=INK)
         label(other, axis, crossings(geographic, axis, values, float(high[1 - axis])), texts)
     if frame is None:
         axes.set(xlabel="x (model units)", ylabel="y (model units)")
     else:
-        unit = parse_crs(frame.crs).axis_info[0].unit_name.replace("metre", "m")
-        axes.set(xlabel=f"Easting ({unit}), {crs_title(frame)}", ylabel=f"Northing ({unit})")
+        counted = parse_crs(frame.crs).axis_info[:2]
+        unit = counted[0].unit_name.replace("metre", "m")
+        names = ["Easting", "Northing"]
+        if {axis.direction for axis in counted} == {"west", "south"}:
+            names = [counted[k].name for k in across]
+        axes.set(xlabel=f"{names[0]} ({unit}), {crs_title(frame)}", ylabel=f"{names[1]} ({unit})")
+
+
+def _geographic(frame: LocalFrame, low: XY, high: XY) -> Affine:
+    """Fit the matrix to longitude and latitude, in which longitude continues across the date line."""
+    return affine(low, high, lambda xyz: degrees(frame, xyz[:, :2]))
 
 
 def affine(low: XY, high: XY, transform: Callable[[np.ndarray], np.ndarray]) -> Affine:
@@ -406,11 +422,13 @@ def _lost_cameras(findings: Findings, corners: Float64[np.ndarray, "2 2"]) -> di
     """Where photographs that are not in the model were taken, as far as known."""
     if findings.frame is None:
         return {}
-    geographic = affine(corners[0], corners[1], findings.frame.to_geographic)
+    frame = findings.frame
+    geographic = _geographic(frame, corners[0], corners[1])
     lost = {photograph.name for photograph in findings.left_out}
     return {
         p.name: np.linalg.solve(
-            geographic[:, :2], np.array((p.position.longitude_deg, p.position.latitude_deg)) - geographic[:, 2]
+            geographic[:, :2],
+            (near_longitude(p.position.longitude_deg, frame.longitude_deg), p.position.latitude_deg) - geographic[:, 2],
         )
         for p in findings.survey.photographs
         if p.name in lost and p.position is not None

@@ -19,7 +19,7 @@ from jaxtyping import Float64
 from shapely.geometry import mapping
 from shapely.geometry.base import BaseGeometry
 
-from tidefield.geometry.geodesy import WGS84, LocalFrame, lost_in_conversion, parse_crs
+from tidefield.geometry.geodesy import WGS84, LocalFrame, lost_in_conversion, near_longitude, parse_crs
 from tidefield.geometry.lenses import FisheyeLens, lens_from_colmap
 from tidefield.survey.colour import ExposureCorrection
 from tidefield.survey.report.findings import Comparison, Findings
@@ -215,12 +215,6 @@ def geojson(findings: Findings, statistics: Statistics) -> dict[str, Any]:
     frame = findings.frame
     assert frame is not None, "a model without a georeference has no map"
 
-    def degrees(xy: Float64[np.ndarray, "N 2"]) -> Float64[np.ndarray, "N 2"]:
-        found = frame.to_geographic(np.c_[xy, np.zeros(len(xy))])[:, :2].round(DECIMALS)
-        # Outlines over the date line would reach around the Earth; beyond 180 degrees they stay together.
-        found[:, 0] += 360 * np.rint((frame.longitude_deg - found[:, 0]) / 360)
-        return found
-
     return {
         "type": "FeatureCollection",
         "title": findings.title,
@@ -228,13 +222,20 @@ def geojson(findings: Findings, statistics: Statistics) -> dict[str, Any]:
         "features": [
             {
                 "type": "Feature",
-                "geometry": mapping(shapely.transform(place, degrees)),
+                "geometry": mapping(shapely.transform(place, lambda xy: degrees(frame, xy).round(DECIMALS))),
                 "properties": {"kind": layer.name, **properties},
             }
             for layer in layers(findings, statistics)
             for place, properties in layer.features
         ],
     }
+
+
+def degrees(frame: LocalFrame, xy: Float64[np.ndarray, "N 2"]) -> Float64[np.ndarray, "N 2"]:
+    """Convert places at height 0 to longitude and latitude; beyond 180 degrees, outlines over the date line stay
+    together, which would reach around the Earth."""
+    found = frame.to_geographic(np.c_[xy, np.zeros(len(xy))])[:, :2]
+    return np.c_[near_longitude(found[:, 0], frame.longitude_deg), found[:, 1]]
 
 
 def projected(findings: Findings, statistics: Statistics) -> list[Layer]:
@@ -314,7 +315,7 @@ def _coverage(statistics: Statistics) -> Numbers:
 def _opensfm_errors(comparison: Comparison) -> Numbers:
     errors = comparison.residuals.error_m[comparison.used]
     if not len(errors):
-        return {}
+        return {"count": 0, "not_used": len(comparison.used)}
     horizontal, vertical = np.linalg.norm(errors[:, :2], axis=1), np.abs(errors[:, 2])
     rms = np.sqrt((errors**2).mean(0))
     return {
@@ -474,7 +475,7 @@ def _clock_remark(findings: Findings, statistics: Statistics) -> list[str]:
     mine = [i for i, name in enumerate(gps.residuals.names) if gps.used[i] and name in row]
     rows = np.array([row[gps.residuals.names[i]] for i in mine], dtype=int)
     position = statistics.block.position[:, :2]
-    heading = headings(position, statistics.order)[rows]
+    heading = headings(position, statistics.flights)[rows]
     if len(rows) < FEWEST_CLUSTERED or np.linalg.norm(heading.mean(0)) > 0.5:
         return []  # with one direction of flight the lag is a common shift
     error = gps.residuals.error_m[mine, :2]
@@ -483,9 +484,12 @@ def _clock_remark(findings: Findings, statistics: Statistics) -> list[str]:
     spread = 1.4826 * float(np.median(np.abs(along - lag_m)))
     if not abs(lag_m) > max(LAG_M, LAG_SPREADS * spread):
         return []
-    times = np.array([photograph.time_s for photograph in statistics.photographs])[statistics.order]
-    speed = np.linalg.norm(np.diff(position[statistics.order], axis=0), axis=1) / np.diff(times).clip(1e-9)
-    seconds = abs(lag_m) / float(np.median(speed))
+    times = np.array([photograph.time_s for photograph in statistics.photographs])
+    speed = [
+        np.linalg.norm(np.diff(position[order], axis=0), axis=1) / np.diff(times[order]).clip(1e-9)
+        for order in statistics.flights
+    ]
+    seconds = abs(lag_m) / float(np.median(np.concatenate(speed)))
     clock = f", as if the clocks of camera and receiver differed by about {seconds:.1f} s" if seconds < 60 else ""
     return [
         "The residuals of the positions fall into two clusters, one for each direction of flight: the receiver's "

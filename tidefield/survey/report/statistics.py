@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +11,7 @@ from jaxtyping import Bool, Float64, Int, UInt16
 from shapely import Polygon
 from shapely.geometry.polygon import orient
 
+from tidefield.survey.io.photographs import by_camera
 from tidefield.survey.report.block import Block, read_block
 from tidefield.survey.report.findings import Findings
 from tidefield.survey.report.ground import fit_ground, footprints
@@ -18,6 +20,9 @@ from tidefield.survey.survey import Photograph
 LONG_SIDE = 600  # cells
 SAME_PLACE = 0.02  # of the height: photographs nearer than this were taken from one place
 PARALLEL_DEG = 30.0
+
+Flights = tuple[Int[np.ndarray, " K"], ...]
+"""Indices of photographs in the order of a flight, for each of the flights."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +57,7 @@ class Statistics:
     Attributes:
         block: the model as arrays.
         photographs: what was read of each registered photograph.
-        order: registered photographs in the order of the flight: by time, or by name where times are missing.
+        flights: registered photographs in the order of each flight: by time, or by name where times are missing.
         gsd: ground sampling distance of every photograph: median over its points of z-depth / focal length.
         height: of every camera above the ground beneath.
         footprints: what each covers of the ground, counter-clockwise x and y; empty if it sees none.
@@ -69,7 +74,7 @@ class Statistics:
 
     block: Block
     photographs: tuple[Photograph, ...]
-    order: Int[np.ndarray, " N"]
+    flights: Flights
     gsd: Float64[np.ndarray, " N"]
     height: Float64[np.ndarray, " N"]
     footprints: tuple[Polygon, ...]
@@ -83,6 +88,11 @@ class Statistics:
     observed: Int[np.ndarray, " N"]
     track_length: Int[np.ndarray, " P"]
 
+    @property
+    def order(self) -> Int[np.ndarray, " N"]:
+        """The photographs of one flight after the other."""
+        return np.concatenate(self.flights)
+
 
 def measure(findings: Findings) -> Statistics:
     """Compute all statistics of the reconstruction.
@@ -93,19 +103,18 @@ def measure(findings: Findings) -> Statistics:
     block = read_block(findings.reconstruction, level=findings.frame is None)
     known = {photograph.name: photograph for photograph in findings.survey.photographs}
     photographs = tuple(known[name] for name in block.names)
-    times = np.array([photograph.time_s for photograph in photographs])
-    order = np.arange(len(times)) if np.isnan(times).any() else np.argsort(times, kind="stable")
+    flights = find_flights(photographs)
     track_length = np.bincount(block.point, minlength=len(block.points))
     trusted = block.points[track_length > 2]
     ground = fit_ground(trusted if len(trusted) >= len(block.points) / 4 else block.points)
     height = ground.above(block.position)
     outlines = footprints(block, ground)
-    forward, side = overlap(outlines, block.position, order, float(np.median(height)))
+    forward, side = overlap(outlines, block.position, flights, float(np.median(height)))
     gsd, error_px, mean_px, rms_px = _resolution_and_errors(block)
     return Statistics(
         block=block,
         photographs=photographs,
-        order=order,
+        flights=flights,
         gsd=gsd,
         height=height,
         footprints=outlines,
@@ -119,6 +128,22 @@ def measure(findings: Findings) -> Statistics:
         observed=np.bincount(block.photograph, minlength=len(block)),
         track_length=track_length,
     )
+
+
+def find_flights(photographs: Sequence[Photograph]) -> Flights:
+    """Sort photographs by time, or by name where times are missing; what two drones, or two cameras of a rig, took at
+    once are two flights."""
+    times = [photograph.time_s for photograph in photographs]
+    groups = by_camera(photographs)
+    if np.isfinite(times).all():
+        groups = sorted((sorted(own, key=times.__getitem__) for own in groups), key=lambda own: times[own[0]])
+    found: list[list[int]] = []
+    for own in groups:
+        if found and not times[own[0]] < times[found[-1][-1]]:
+            found[-1] += own
+        else:
+            found.append(own)
+    return tuple(np.array(own, dtype=np.int64) for own in found)
 
 
 def _resolution_and_errors(block: Block) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -164,21 +189,21 @@ def unite(footprints: tuple[Polygon, ...]) -> shapely.MultiPolygon:
 
 
 def overlap(
-    footprints: tuple[Polygon, ...], position: Float64[np.ndarray, "N 3"], order: Int[np.ndarray, " N"], height: float
+    footprints: tuple[Polygon, ...], position: Float64[np.ndarray, "N 3"], flights: Flights, height: float
 ) -> tuple[Float64[np.ndarray, " N"], Float64[np.ndarray, " N"]]:
     """Measure forward and side overlap from geometry alone, so that a missing photograph shows as a gap.
 
     Args:
         footprints: of every photograph; their convex hulls are compared.
         position: of the cameras.
-        order: photographs in the order of the flight, from which its heading follows.
+        flights: photographs in the order of each flight, from which its heading follows.
         height: of the flight above ground.
 
     Returns:
         `Statistics.forward_overlap` and `side_overlap`.
     """
     hulls = shapely.convex_hull(np.array(footprints, dtype=object))
-    heading = headings(position[:, :2], order)
+    heading = headings(position[:, :2], flights)
     forward, side = np.full((2, len(position)), np.nan)
 
     def shared(i: int, distance: Float64[np.ndarray, " N"], among: Bool[np.ndarray, " N"]) -> float:
@@ -201,15 +226,15 @@ def overlap(
     return forward, side
 
 
-def headings(xy: Float64[np.ndarray, "N 2"], order: Int[np.ndarray, " N"]) -> Float64[np.ndarray, "N 2"]:
-    """Unit vectors of the flight's heading: along the shorter leg, before or after the photograph."""
-    if len(xy) < 2:
-        return np.tile([[1.0, 0.0]], (len(xy), 1))
-    steps = np.diff(xy[order], axis=0)
-    length = np.linalg.norm(steps, axis=1)
-    arriving, leaving = np.r_[np.inf, length], np.r_[length, np.inf]
-    index = np.arange(len(xy))
-    chosen = steps[np.where(arriving < leaving, index - 1, np.minimum(index, len(steps) - 1))]
-    heading = np.empty_like(xy)
-    heading[order] = chosen / np.maximum(np.linalg.norm(chosen, axis=1, keepdims=True), 1e-9)  # hovering has none
+def headings(xy: Float64[np.ndarray, "N 2"], flights: Flights) -> Float64[np.ndarray, "N 2"]:
+    """Unit vectors of the flight's heading: along the shorter leg, before or after the photograph; zero if it hovers or
+    is the only one of its flight."""
+    heading = np.zeros_like(xy)
+    for order in (order for order in flights if len(order) > 1):
+        steps = np.diff(xy[order], axis=0)
+        length = np.linalg.norm(steps, axis=1)
+        arriving, leaving = np.r_[np.inf, length], np.r_[length, np.inf]
+        index = np.arange(len(order))
+        chosen = steps[np.where(arriving < leaving, index - 1, np.minimum(index, len(steps) - 1))]
+        heading[order] = chosen / np.maximum(np.linalg.norm(chosen, axis=1, keepdims=True), 1e-9)
     return heading
