@@ -132,6 +132,8 @@ def test_photographs_of_the_chain_come_with_control_that_fits_them(pair, chain):
         assert len(error) > 12
         assert 0.15 < error.std() < 0.6  # marks are set to 0.3 pixels
         assert np.abs(error.mean(axis=0)).max() < 0.3
+        bed = made.flat.bed.sample(torch.from_numpy(points[:, :2].T.copy()).float())[0].numpy()
+        assert np.abs(points[:, 2] - bed).max() < 0.1  # surveyed to 1 cm
         stated = [photograph.position for photograph in survey.photographs]
         places = [[at.longitude_deg, at.latitude_deg, at.height_m] for at in stated if at is not None]
         off = frame.from_geographic(np.array(places)) - made.cameras.position_world.double().numpy()
