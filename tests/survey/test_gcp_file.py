@@ -229,7 +229,7 @@ def test_the_system_that_fits_is_named(crs, x, y, expected):
 
 
 def test_zones_of_the_datums_that_receivers_use_are_suggested_first():
-    message = refusal("EPSG:32631", 516100.0, 6040500.0)
+    message = refusal("EPSG:32631", 514600.0, 6039000.0, (-2.7735, 54.5))
     first, second, *_ = re.findall(r"EPSG:(\d+) \(", message.partition("would fit in ")[2])
     assert {first, second} == {"25830", "32630"}
     assert "WGS 72" not in message

@@ -20,7 +20,7 @@ import warnings
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import TypeAlias, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from jaxtyping import Float64
@@ -253,7 +253,8 @@ def parse_crs(text: str) -> CRS:
 
 def near_longitude(degrees: _Degrees, reference: float) -> _Degrees:
     """Turn longitudes by whole circles to within 180 degrees of another, so that they continue across the date line."""
-    return degrees + 360 * np.rint((reference - degrees) / 360)
+    circles: Any = np.rint((reference - degrees) / 360)
+    return degrees + 360 * circles
 
 
 def metres_per_degree(latitude_deg: float) -> tuple[float, float]:

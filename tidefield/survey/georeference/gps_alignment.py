@@ -315,7 +315,7 @@ def fit_positions(
         )
     error = similarity(centres) - given
     spread_m = rms_m((given[used] - given[used].mean(0))[:, :2])
-    if np.count_nonzero(used) < 3 or rms_m(error[used, :2]) >= 0.5 * spread_m:
+    if np.count_nonzero(used) < 3 or rms_m(error[used, :2]) >= 0.5 * spread_m or spread_m < _LEAST_M:
         return None
     distance = np.linalg.norm(error, axis=1)
     typical = metres(float(np.median(distance[used])))

@@ -215,6 +215,9 @@ def geojson(findings: Findings, statistics: Statistics) -> dict[str, Any]:
     frame = findings.frame
     assert frame is not None, "a model without a georeference has no map"
 
+    def rounded(xy: Float64[np.ndarray, "N 2"]) -> Float64[np.ndarray, "N 2"]:
+        return degrees(frame, xy).round(DECIMALS)
+
     return {
         "type": "FeatureCollection",
         "title": findings.title,
@@ -222,7 +225,7 @@ def geojson(findings: Findings, statistics: Statistics) -> dict[str, Any]:
         "features": [
             {
                 "type": "Feature",
-                "geometry": mapping(shapely.transform(place, lambda xy: degrees(frame, xy).round(DECIMALS))),
+                "geometry": mapping(shapely.transform(place, rounded)),
                 "properties": {"kind": layer.name, **properties},
             }
             for layer in layers(findings, statistics)
