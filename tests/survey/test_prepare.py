@@ -27,7 +27,7 @@ from tidefield.geometry.lenses import FisheyeLens
 from tidefield.survey.georeference.gps_alignment import camera_centres
 from tidefield.survey.io.photographs import read_survey
 from tidefield.survey.prepare import Prepared, _fingerprint, _is_rounded, _require_control, prepare
-from tidefield.survey.quality.assessment import without
+from tidefield.survey.quality.assessment import assess_quality, without
 from tidefield.survey.report import collect_findings, write_report
 from tidefield.survey.sfm import features, matching
 from tidefield.survey.sfm.blocks import cut
@@ -527,9 +527,15 @@ def test_masks_go_into_the_scene_and_no_point_is_seen_in_them(flight: Flight, tm
     masked = loaded.points.camera_index != loaded.index(flight.names[-1])
     assert loaded.points.uv_px[masked, 1].max() < ground_flight.HEIGHT - 60
     assert loaded.points.uv_px[~masked, 1].max() > ground_flight.HEIGHT - 60
-    # Without the masks everything after the features is done again, and the scene has none.
+    # Without the masks everything is done again, as photographs are judged by what is used, and the scene has none.
     shutil.rmtree(card / "masks")
-    run(card, scene)
+    with pytest.MonkeyPatch.context() as patch:
+        judged = []
+        patch.setattr(
+            "tidefield.survey.prepare.assess_quality", lambda *given: judged.append(1) or assess_quality(*given)
+        )
+        run(card, scene)
+    assert judged
     assert not (scene / "masks").exists()
 
 

@@ -134,7 +134,10 @@ def prepare(
             return {"verdicts": [_to_json(verdict) for verdict in verdicts]}
 
         # No option is part of the key of scenes that do not have it, so that earlier ones are kept.
-        verdicts = stages.run("quality", {"holdout": True} if holdout else {}, [], judge_quality, _verdicts_from_json)
+        judged: dict[str, Any] = {"holdout": True} if holdout else {}
+        if used := _masks_fingerprint(survey):
+            judged["masks"] = used
+        verdicts = stages.run("quality", judged, [], judge_quality, _verdicts_from_json)
         good = select_photographs(survey, verdicts, keep_all)
         names = [photograph.name for photograph in good.photographs]
         mapped = without(good, held_out)
