@@ -1,6 +1,7 @@
 """Areas and sections, as GIS programs write them."""
 
 import json
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -80,8 +81,11 @@ def test_a_file_that_refers_to_other_data_is_refused(tmp_path: Path):
     other = write(tmp_path / "other.geojson", polygon(SQUARE))
     source = f"<OGRVRTLayer name='other'><SrcDataSource>{other}</SrcDataSource></OGRVRTLayer>"
     (tmp_path / "a.geojson").write_text(f"<OGRVRTDataSource>{source}</OGRVRTDataSource>")
-    with pytest.raises(RunError, match=r"a\.geojson refers to other data: expected polygons or lines as GeoJSON"):
-        read_shapes(tmp_path / "a.geojson", FRAME, "Polygon")
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
+        archive.write(tmp_path / "a.geojson", "a.vrt")
+    for name in ("a.geojson", "a.zip"):
+        with pytest.raises(RunError, match="refers to other data: expected polygons or lines as GeoJSON"):
+            read_shapes(tmp_path / name, FRAME, "Polygon")
 
 
 @pytest.mark.parametrize("frame", [FRAME, LOCAL])

@@ -510,6 +510,12 @@ def test_hemispheres_are_known_by_what_is_in_their_columns(tmp_path, titles, sou
     assert remarks == []
 
 
+def test_one_column_of_a_hemispheres_letter_is_none(tmp_path):
+    text = "image,lat,lon,fix\nDJI_0001.JPG,54.1,8.2,S\nDJI_0002.JPG,54.1,8.3,S\n"
+    found, _ = read_gps_file(written(tmp_path, text), NAMES)
+    assert {record.position.latitude_deg for record in found.values()} == {54.1}
+
+
 def test_a_column_of_other_words_is_no_hemisphere(tmp_path):
     text = "image,lat,lon,wind,line\nDJI_0001.JPG,41.47,72.94,W,S\nDJI_0002.JPG,41.47,72.95,SW,3\n"
     found, _ = read_gps_file(written(tmp_path, text), NAMES)

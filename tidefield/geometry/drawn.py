@@ -99,7 +99,7 @@ def read_drawn(path: Path) -> Drawn:
             )
         with path.open("rb") as file:
             start = file.read(1 << 16)
-    if any(words in start for words in _REFERENCES):
+    if any(words in start for words in _REFERENCES) or start.startswith(b"PK"):  # an archive may hold such a file
         raise RunError(f"{path} refers to other data: {_EXPECTED}")
     try:
         layer = _layer(path, [str(name) for name, kind in list_layers(path) if kind is not None], asked)

@@ -324,14 +324,17 @@ def _read_table(
 
 
 def _hemispheres(rows: Sequence[Sequence[str]], columns: Iterable[int]) -> dict[str, int]:
-    """The first columns that have nothing but the hemispheres of latitudes and of longitudes, whatever their titles."""
+    """The first columns that have nothing but the hemispheres of latitudes and of longitudes, whatever their titles.
+
+    A column of S alone may state something else, such as a fix.
+    """
     found: dict[str, int] = {}
     for index in columns:
         cells = {row[index].upper() for row in rows} - {""}
         for key, names in _HEMISPHERES.items():
             if cells and cells <= names:
                 found.setdefault(key, index)
-    return found
+    return found if len(found) == 2 else {}
 
 
 def _is_numeric(rows: Sequence[Sequence[str]], index: int) -> bool:
