@@ -8,19 +8,20 @@ from typing import Any
 import numpy as np
 import pytest
 import shapely
-from pyproj import Transformer
+from pyproj import CRS, Transformer
 from rich.console import Console
 
 from tidefield.commands.map_ import Map, map_
 from tidefield.errors import RunError
+from tidefield.geometry.drawn import read_drawn
 from tidefield.geometry.geodesy import LocalFrame, parse_crs
-from tidefield.maps.area import inside, read_shapes, touches
-from tidefield.maps.grid import Grid, MapFrame
+from tidefield.maps.area import inside, touches
+from tidefield.maps.grid import LOCAL_WKT, Grid, MapFrame
 
 EAST, NORTH, SIDE = 400_000.0, 500_000.0, 80.0
 WKT = parse_crs("EPSG:27700").to_wkt()
 FRAME = MapFrame(LocalFrame.at("EPSG:27700", (EAST, NORTH, 10.0)), np.zeros(3), np.eye(3), WKT, WKT, "the sea")
-LOCAL = MapFrame(None, np.zeros(3), np.eye(3), WKT, WKT, "local")
+LOCAL = MapFrame(None, np.zeros(3), np.eye(3), LOCAL_WKT, LOCAL_WKT, "local")
 TO = Transformer.from_crs("EPSG:27700", "EPSG:4326", always_xy=True)
 
 
@@ -43,6 +44,11 @@ def polygon(*rings: list[list[float]]) -> dict[str, Any]:
 def write(path: Path, *geometries: Any, **members: Any) -> Path:
     path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature(g) for g in geometries], **members}))
     return path
+
+
+def read_shapes(path: Path, frame: MapFrame, kind: str) -> list[tuple[shapely.Geometry, str]]:
+    found = read_drawn(path).of_kind(kind).placed(CRS.from_wkt(frame.horizontal_wkt)).of_kind(kind)
+    return list(zip(found.geometries, found.names, strict=True))
 
 
 def area(path: Path) -> float:
@@ -75,6 +81,17 @@ def test_areas_are_read_from_other_formats_in_their_own_system(tmp_path: Path, n
     )
     [(found, title)] = read_shapes(tmp_path / name, FRAME, "Polygon")
     assert (found.bounds, title) == ((EAST, NORTH, EAST + SIDE, NORTH + SIDE), "flat")
+
+
+def test_a_system_that_nobody_knows_is_refused(tmp_path: Path):
+    system = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::999999"}}
+    with pytest.raises(RunError, match=r"is no GeoJSON.*999999"):
+        read_shapes(write(tmp_path / "a.geojson", polygon(SQUARE), crs=system), FRAME, "Polygon")
+
+
+def test_a_degenerate_polygon_next_to_a_line_is_no_line(tmp_path: Path):
+    line, spike = {"type": "LineString", "coordinates": SQUARE}, polygon(ring((0, 0), (1, 1), (2, 2)))
+    assert len(read_shapes(write(tmp_path / "a.geojson", line, spike), FRAME, "LineString")) == 1
 
 
 def test_a_file_that_refers_to_other_data_is_refused(tmp_path: Path):

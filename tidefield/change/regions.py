@@ -61,11 +61,11 @@ def read_regions(path: Path, grid: Grid) -> list[Region]:
         RunError: as `read_drawn` and `Drawn.placed`.
         ChangeError: it has no geometry on the grid.
     """
-    drawn = read_drawn(path)
+    drawn = read_drawn(path).placed(None if grid.crs is None else CRS.from_wkt(grid.crs))
     found: list[Region] = []
     taken = {"all"}  # what tables call the whole survey
-    for k, geometry in enumerate(drawn.placed(None if grid.crs is None else CRS.from_wkt(grid.crs))):
-        name = own = drawn.names[k] or str(k + 1)
+    for number, (geometry, own) in enumerate(zip(drawn.geometries, drawn.names, strict=True), start=1):
+        name = own = own or str(number)
         times = 1
         while name in taken:
             times += 1

@@ -294,20 +294,26 @@ def warped(
 def opened(path: Path) -> Iterator[Any]:
     """A raster file, opened."""
     rasterio = need("rasterio")
-    with reading_from(path):
-        path.open("rb").close()
+    with reading_from(path), path.open("rb") as file:
+        start = file.read(64).lstrip(b"\xef\xbb\xbf \t\r\n")
+    if start[:1] in (b"<", b"{") and not start.startswith(b"<VRTDataset") and path.suffix[1:].upper() not in _REFERRING:
+        raise _refers(path, "text")  # GDAL asks the address as it opens such a file
     try:
         with rasterio.Env(GDAL_CACHEMAX=128), rasterio.open(path) as dataset:
             if dataset.driver in _REFERRING and dataset.driver.lower() != path.suffix[1:].lower():
-                raise ChangeError(
-                    f"{path} refers to other files or addresses ({dataset.driver}): expected a GeoTIFF, or a mosaic "
-                    "whose name ends in .vrt; name another, or rename it"
-                )
+                raise _refers(path, dataset.driver)
             yield dataset
     except rasterio.errors.RasterioIOError as error:
         raise ChangeError(
             f"{path} is not a raster that can be read ({error}): expected a GeoTIFF of heights; name another"
         ) from error
+
+
+def _refers(path: Path, what: str) -> ChangeError:
+    return ChangeError(
+        f"{path} refers to other files or addresses ({what}): expected a GeoTIFF, or a mosaic whose name ends in .vrt; "
+        "name another, or rename it"
+    )
 
 
 def open_surface(path: Path, date: str | None = None) -> Surface:

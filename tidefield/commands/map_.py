@@ -66,7 +66,6 @@ def map_(options: Map, console: Console) -> dict[str, Any]:
     """Run `tidefield map`."""
     from tidefield.cluster import absolute, connected, share_of
     from tidefield.files import only_writer
-    from tidefield.maps.area import read_shapes
     from tidefield.maps.make import TileMaker, delete_tiles, finish_map, make_tiles
     from tidefield.progress import ProgressBar
 
@@ -77,9 +76,6 @@ def map_(options: Map, console: Console) -> dict[str, Any]:
     # Before photographs are read, which may take minutes.
     if options.gsd is not None and options.gsd <= 0:
         raise RunError(f"--gsd {options.gsd:g} was asked for: expected the side of a cell, above 0; choose another")
-    for path, kind in ((options.area, "Polygon"), (options.sections, "LineString")):
-        if path is not None:
-            read_shapes(path, None, kind)
     with ExitStack() as stack:
         stack.enter_context(only_writer(options.out))
         opened = stack.enter_context(ExitStack())
@@ -134,17 +130,21 @@ def _in_blocks(
 @contextmanager
 def open_job(options: Map, console: Console) -> Iterator[tuple[Job, Render, dict[str, Any]]]:
     """What a map is made of, the method while the block lasts, and the record of its source."""
+    from pyproj import CRS
     from shapely import union_all
 
     from tidefield.data.georeference import find_georeference
     from tidefield.data.load import at_width
     from tidefield.device import choose_device
-    from tidefield.maps.area import read_shapes
+    from tidefield.geometry.drawn import read_drawn
     from tidefield.maps.check_points import all_check_points
     from tidefield.maps.grid import make_grid, map_frame
     from tidefield.maps.make import Job
 
     device = choose_device(options.device)
+    # Before photographs are read, which may take minutes.
+    drawn = options.area and read_drawn(options.area).of_kind("Polygon")
+    cuts = options.sections and read_drawn(options.sections).of_kind("LineString")
     with open_source(options.source, options.zero, device, options.allow_missing, console, hold_out=False) as (
         scene,
         render,
@@ -152,13 +152,13 @@ def open_job(options: Map, console: Console) -> Iterator[tuple[Job, Render, dict
     ):
         georeference = find_georeference(scene.root, scene.reference)
         frame = map_frame(scene, georeference, options.heights)
-        area, interval = None, options.contours and options.contours * frame.metre_up
-        if options.area is not None:
-            area = union_all([shape for shape, _ in read_shapes(options.area, frame, "Polygon")])
+        system, interval = CRS.from_wkt(frame.horizontal_wkt), options.contours and options.contours * frame.metre_up
+        area = drawn and union_all(drawn.placed(system).of_kind("Polygon").geometries)
         widest = max(file.lens.width for file in scene.photographs.files)
         full = scene if scene.cameras.width >= widest else at_width(scene, widest)
         grid = make_grid(frame, full, options.gsd, None if area is None else area.bounds)
-        lines = () if options.sections is None else tuple(read_shapes(options.sections, frame, "LineString"))
+        cuts = cuts and cuts.placed(system).of_kind("LineString")
+        lines = tuple(zip(cuts.geometries, cuts.names, strict=True)) if cuts else ()
         points = all_check_points(full, frame, options.check, georeference)
         job = Job(full, grid, area, options.fill, {"method": record}, tuple(points), interval, lines)
         yield job, render, {"scene": scene.root.resolve().name, "method": record}

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import shapely
-from pyproj import CRS, Transformer
+from pyproj import CRS
 from pyproj.exceptions import ProjError
-from shapely.geometry.base import BaseGeometry
+from shapely.geometry.base import BaseGeometry, BaseMultipartGeometry
 
 from tidefield.errors import RunError, need
 from tidefield.files import reading_from
-from tidefield.geometry.geodesy import is_local, lost_in_conversion
+from tidefield.geometry.geodesy import is_local, lost_in_conversion, transformer
 
 _log = logging.getLogger(__name__)
 
@@ -25,6 +27,8 @@ _EXPECTED = "expected polygons or lines as GeoJSON, GeoPackage or shapefile; nam
 _NAMES = ("name", "id", "label", "title", "location", "tr_id")
 _REFERENCES = (b"<OGR", b"gdal_streamed_alg")
 """Of GDAL's files that refer to other files, or addresses."""
+_SYSTEM = re.compile(rb'"crs"\s*:\s*\{[^}]*"name"\s*:\s*"([^"]+)"')
+"""The name in the member `crs` of a GeoJSON file."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +47,23 @@ class Drawn:
     names: list[str]
     crs: CRS | None
 
-    def placed(self, to: CRS | None) -> list[BaseGeometry]:
+    def of_kind(self, kind: str) -> Drawn:
+        """Select the geometries of a kind, "Polygon" or "LineString", and those in collections, with their names.
+
+        Raises:
+            RunError: there is none.
+        """
+        parts = [
+            (part, name)
+            for shape, name in zip(self.geometries, self.names, strict=True)
+            for part in _parts(shape)
+            if part.geom_type == kind and not part.is_empty
+        ]
+        if not parts:
+            raise RunError(f"{self.path} has no {kind}: expected at least one; draw it in a GIS")
+        return replace(self, geometries=[part for part, _ in parts], names=[name for _, name in parts])
+
+    def placed(self, to: CRS | None) -> Drawn:
         """Return the geometries in another system, valid; as they are where either has no place on Earth.
 
         An outline that crosses itself, as drawn by hand, has an inside all the same.
@@ -54,7 +74,7 @@ class Drawn:
         found = self.geometries
         if self.crs is not None and to is not None and not is_local(to):
             try:
-                transformer = Transformer.from_crs(self.crs, to, always_xy=True)
+                there = transformer(self.crs, to)
             except ProjError as error:
                 raise RunError(
                     f"{self.path} cannot be converted to {to.name} ({error}): expected a system that fits its place; "
@@ -64,13 +84,13 @@ class Drawn:
                 _log.warning(f"{self.path.name}: coordinates {lost}")
 
             def converted(xy: np.ndarray) -> np.ndarray:
-                return np.column_stack(transformer.transform(*xy.T))
+                return np.column_stack(there.transform(*xy.T))
 
             found = [shapely.transform(shape, converted) for shape in found]
         if not all(np.isfinite(shapely.get_coordinates(shape)).all() for shape in found):
             name = "any system" if to is None else to.name
             raise RunError(f"{self.path} has coordinates outside of {name}: expected places there; correct them")
-        return [shapely.make_valid(shape) for shape in found]
+        return replace(self, geometries=[shapely.make_valid(shape) for shape in found], crs=to)
 
 
 def read_drawn(path: Path) -> Drawn:
@@ -83,7 +103,7 @@ def read_drawn(path: Path) -> Drawn:
         RunError: it cannot be read, is too large, or has several layers, or no geometry.
     """
     need("pyogrio")
-    from pyogrio import list_layers, raw, read_info
+    from pyogrio import list_layers, raw
     from pyogrio.errors import DataLayerError, DataSourceError
 
     asked = None
@@ -99,15 +119,17 @@ def read_drawn(path: Path) -> Drawn:
             )
         with path.open("rb") as file:
             start = file.read(1 << 16)
+            whole = start + file.read() if start.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"{") else b""
     if any(words in start for words in _REFERENCES) or start.startswith(b"PK"):  # an archive may hold such a file
         raise RunError(f"{path} refers to other data: {_EXPECTED}")
     try:
+        if named := _SYSTEM.search(whole):  # GDAL takes longitude and latitude instead of one that it does not know
+            CRS.from_user_input(named[1].decode())
         layer = _layer(path, [str(name) for name, kind in list_layers(path) if kind is not None], asked)
-        about = read_info(path, layer=layer)
         meta, _, shapes, columns = raw.read(path, layer=layer, max_features=_MOST + 1, force_2d=True)
         with np.errstate(invalid="ignore"):  # `Drawn.placed` refuses what is not finite
             geometries = shapely.from_wkb(shapes)
-        crs = CRS(about["crs"]) if about["crs"] else None
+        crs = CRS(meta["crs"]) if meta["crs"] else None
     except (DataSourceError, DataLayerError, ValueError, ProjError, shapely.errors.ShapelyError) as error:
         raise RunError(f"{path} is no GeoJSON, GeoPackage or shapefile ({error}): {_EXPECTED}") from error
     if len(geometries) > _MOST:
@@ -126,6 +148,15 @@ def read_drawn(path: Path) -> Drawn:
     )
 
 
+def _parts(shape: BaseGeometry) -> Iterator[BaseGeometry]:
+    """The single geometries in a collection of collections."""
+    if isinstance(shape, BaseMultipartGeometry):
+        for part in shape.geoms:
+            yield from _parts(part)
+    else:
+        yield shape
+
+
 def _layer(path: Path, layers: list[str], asked: str | None) -> str:
     """The layer that is read of those with geometries."""
     if asked is None and len(layers) == 1:
@@ -140,7 +171,7 @@ def _layer(path: Path, layers: list[str], asked: str | None) -> str:
 
 
 def _name(value: Any) -> str:
-    """A name in a column; empty where there is none. Whole numbers beside missing ones are read as floats."""
+    """A name in a column; empty where there is none. Whole numbers next to missing ones are read as floats."""
     if isinstance(value, np.ndarray | list | tuple):
         return ", ".join(filter(None, map(_name, value)))
     if value is None or value != value:  # NaN and NaT differ from themselves

@@ -1,48 +1,13 @@
-"""Polygons and lines of a user, in a map's coordinates."""
+"""An area that is mapped, on a map's tiles."""
 
 from __future__ import annotations
-
-from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import shapely
 from jaxtyping import Bool
-from pyproj import CRS
-from shapely.geometry.base import BaseGeometry, BaseMultipartGeometry
+from shapely.geometry.base import BaseGeometry
 
-from tidefield.errors import RunError
-from tidefield.geometry.drawn import read_drawn
-from tidefield.maps.grid import MapFrame, Tile
-
-
-def read_shapes(path: Path, frame: MapFrame | None, kind: str) -> list[tuple[BaseGeometry, str]]:
-    """Read the geometries of a file and their names, in map coordinates; with a local frame, as they are.
-
-    Args:
-        path: the file.
-        frame: map coordinates; None leaves those of the file.
-        kind: of geometries that are wanted: "Polygon" or "LineString".
-
-    Raises:
-        RunError: as `read_drawn` and `Drawn.placed`, or the file has no such geometry.
-    """
-    drawn = read_drawn(path)
-    target = None if frame is None or frame.frame is None else CRS.from_wkt(frame.horizontal_wkt)
-    placed = zip(drawn.placed(target), drawn.names, strict=True)
-    shapes = [(part, name) for shape, name in placed for part in _parts(shape, kind)]
-    if not shapes:
-        raise RunError(f"{path} has no {kind}: expected at least one; draw it in a GIS")
-    return shapes
-
-
-def _parts(shape: BaseGeometry, kind: str) -> Iterator[BaseGeometry]:
-    """The geometries of a kind in a collection of collections."""
-    if isinstance(shape, BaseMultipartGeometry):
-        for part in shape.geoms:
-            yield from _parts(part, kind)
-    elif shape.geom_type == kind and not shape.is_empty:
-        yield shape
+from tidefield.maps.grid import Tile
 
 
 def inside(area: BaseGeometry | None, tile: Tile) -> Bool[np.ndarray, "H W"]:
