@@ -67,9 +67,10 @@ def _pair(category: str, seed: int) -> dict[str, Any]:
     pictures, plants, wet, paths = [], [], [], []
     with tempfile.TemporaryDirectory() as folder:
         for k, survey in enumerate((pair.earlier, pair.later)):
-            colour = survey.flat.map(extent)[0].numpy() * 255 * (gains if k else 1)
+            colour, seen = (part.numpy() for part in survey.flat.map(extent))
+            colour = colour * 255 * (gains if k else 1)
             pictures.append((colour + random.normal(0, NOISE, colour.shape)).clip(0, 255).astype(np.uint8))
-            plants.append(covered(survey.flat, extent))
+            plants.append(covered(survey.flat, seen, extent))
             wet.append(_under(survey, extent, levels[k]))
             heights = surveyed(survey.flat.surface, extent, random, ERRORS)
             paths.append(write_surface(Path(folder) / f"{k}.tif", heights, extent))
@@ -100,9 +101,13 @@ def _pair(category: str, seed: int) -> dict[str, Any]:
     }
 
 
-def covered(flat: TidalFlat, extent: Extent) -> np.ndarray:
-    """Cells, row 0 in the north, that drawn plants cover seen straight down, closed as the product averages colours."""
-    plants = _on(flat.seen(extent), extent) - _on(flat.surface, extent) > BARE_M
+def covered(flat: TidalFlat, seen: np.ndarray, extent: Extent) -> np.ndarray:
+    """Cells, row 0 in the north, that drawn plants cover seen straight down, closed as the product averages colours.
+
+    Args:
+        seen: heights that are seen straight down, metres, as `TidalFlat.map` returns them.
+    """
+    plants = seen - _on(flat.surface, extent) > BARE_M
     reach = round(WINDOW_M / extent.cell_m)
     window = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
     return cv2.morphologyEx(plants.astype(np.uint8), cv2.MORPH_CLOSE, window).astype(bool)

@@ -25,6 +25,7 @@ from tidefield.errors import RunError
 from tidefield.files import write_json
 from tidefield.machine import describe
 from tidefield.maps.grid import Grid, Tile, ground_sampling_distance, make_grid, map_frame
+from tidefield.maps.make import FEWEST_VIEWS
 from tidefield.maps.surface import COARSEST, match, sparse_surface
 from tidefield.maps.views import GreyPhotographs
 from tidefield.survey.io.text_files import PhotographNames, leading_numbers, read_list
@@ -85,6 +86,8 @@ def _measure(root: Path, control: Path) -> dict[str, Any]:
         tile = Tile(grid, row - SIDE // 2, column - SIDE // 2, SIDE, 0)
         inside = 0 <= column < grid.columns and 0 <= row < grid.rows
         matched = match(tile, start, scene, grey, gsd) if inside else None
+        if matched is not None and matched.count[SIDE // 2, SIDE // 2] < FEWEST_VIEWS:
+            matched = None  # its height is that of the sparse points
         one: dict[str, Any] = {
             "name": name,
             "marks": len(marks.get(name, [])),

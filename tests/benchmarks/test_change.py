@@ -197,11 +197,11 @@ def test_plants_outside_the_marsh_are_true_cover(pair):
 
     flat = pair.earlier.flat
     extent = Extent.around([-30.0, -25.0], [30.0, 25.0], 0.15)
-    tall = flat.seen(extent).values - flat.surface.sample(extent.nodes()).reshape(1, extent.rows, extent.columns) > 1.2
-    marsh = flat.marsh.sample(extent.nodes()).reshape(tall.shape)
-    trees = (tall & (marsh < 0.02))[0].flip(0).numpy()
+    seen = flat.map(extent)[1]
+    ground, marsh = (raster.sample(extent.nodes()).reshape(seen.shape).flip(0) for raster in (flat.surface, flat.marsh))
+    trees = ((seen - ground > 1.2) & (marsh < 0.02)).numpy()
     assert trees.sum() * 0.15**2 > 5
-    assert covered(flat, extent)[trees].all()
+    assert covered(flat, seen.numpy(), extent)[trees].all()
 
 
 def test_a_work_folder_of_other_options_is_refused(tmp_path, monkeypatch):

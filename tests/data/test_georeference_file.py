@@ -21,6 +21,7 @@ FOUND = Georeference(
     check=Residuals(),
     left_out=(LeftOut("GPS", "c.jpg", "it is 100 km away"),),
     notes=("A note.",),
+    gps_has_part=False,
 )
 
 
@@ -38,6 +39,7 @@ def test_a_georeference_reads_back_as_written(tmp_path):
         assert getattr(again, kind).names == getattr(FOUND, kind).names
         np.testing.assert_array_equal(getattr(again, kind).error_m, getattr(FOUND, kind).error_m)
     np.testing.assert_array_equal(again.world_from_model.translation, [1, 2, 3])
+    assert not again.gps_has_part
 
 
 def test_statistics_use_only_known_and_accepted_residuals(tmp_path):

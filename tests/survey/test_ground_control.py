@@ -87,6 +87,7 @@ def test_the_model_meets_the_control_with_and_without_positions(flight, position
     assert 0.005 < found.check.vertical_rms_m < 0.15
     assert found.left_out == ()
     assert len(found.gps.names) == (15 if positions else 0)
+    assert not found.gps_has_part
 
 
 def test_control_points_are_not_added_to_the_model(flight):
@@ -238,6 +239,7 @@ def test_two_points_shift_the_model_aligned_with_positions(flight):
     assert found.control.names == ("G1", "G2")
     assert found.check.names == ()
     assert any("Fewer than three" in note for note in found.notes)
+    assert found.gps_has_part
     assert np.abs(off_m(flight, model, found)).max() < 3.0
     assert found.control.horizontal_rms_m < 0.5
 
@@ -288,6 +290,7 @@ def test_many_points_marked_once_adjust_the_model_unless_differential_positions_
     )
     with pytest.raises(SurveyError, match="has two marks that fit together"):
         located(accurate, replace(marked_once(with_control(accurate)), photographs=fixed))
+    assert located(accurate, replace(with_control(accurate), photographs=fixed))[1].gps_has_part
 
 
 def test_points_marked_once_that_do_not_fit_the_positions_are_to_be_marked_twice():

@@ -28,7 +28,7 @@ from tidefield.survey.report.block import read_block
 from tidefield.survey.report.figures import affine, coordinates, crossings
 from tidefield.survey.report.ground import fit_ground, footprints
 from tidefield.survey.report.numbers import numbers
-from tidefield.survey.report.statistics import cover, measure, unite
+from tidefield.survey.report.statistics import cover, find_flights, measure, unite
 from tidefield.survey.survey import Survey
 
 FOOTPRINT = (WIDTH * GSD, HEIGHT * GSD)  # 80 by 60
@@ -189,6 +189,14 @@ def test_folders_of_one_card_are_one_flight():
     names = [f"{100 + i // 4}MEDIA/{i:02d}.JPG" for i in range(12)]
     found = measure(findings(flight(2, 6), names))
     assert [own.tolist() for own in found.flights] == [[*range(12)]]
+
+
+def test_a_folder_continues_the_flight_of_its_own_drone():
+    """Of two drones at once, the cards of both get a new folder on the way."""
+    names = [f"{drone}/{100 + i // 3}MEDIA/{i}.JPG" for drone in "ab" for i in range(6)]
+    read = findings(flight(2, 6), names).survey.photographs
+    read = [replace(p, serial=p.name[0], time_s=10.0 * (i % 6) + 5 * (i // 6)) for i, p in enumerate(read)]
+    assert [own.tolist() for own in find_flights(read)] == [[*range(6)], [*range(6, 12)]]
 
 
 def test_a_block_is_read_in_little_more_memory_than_it_has():

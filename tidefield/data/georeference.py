@@ -116,6 +116,7 @@ class Georeference:
         left_out: rejected observations.
         notes: further sentences for the surveyor.
         control_world: surveyed coordinates of all control points that the scene was fitted to.
+        gps_has_part: whether the cameras' positions have placed or shaped the scene, next to ground control.
     """
 
     frame: LocalFrame | None
@@ -127,6 +128,7 @@ class Georeference:
     left_out: tuple[LeftOut, ...]
     notes: tuple[str, ...]
     control_world: Float64[np.ndarray, "N 3"] = field(default_factory=lambda: np.empty((0, 3)))
+    gps_has_part: bool = True
 
     @property
     def gps_used(self) -> Residuals:
@@ -157,6 +159,7 @@ class Georeference:
             "left_out": [asdict(item) for item in self.left_out],
             "notes": list(self.notes),
             "control_world": self.control_world.tolist(),
+            "gps_has_part": self.gps_has_part,
         }
         with completed_file(folder / FILE_NAME, overwrite=True) as partial:
             partial.write_text(json.dumps(values, indent=1, allow_nan=False) + "\n", encoding="utf-8")
@@ -228,6 +231,7 @@ def _from_json(values: dict[str, Any], path: Path) -> Georeference:
         control_world=np.array(
             [numbers({"point": point}, "point", path, (3,)) for point in values.get("control_world", [])]
         ).reshape(-1, 3),
+        gps_has_part=bool(values.get("gps_has_part", True)),
         **residuals,
     )
 

@@ -250,7 +250,7 @@ def match(tile: Tile, start: Start, scene: Scene, grey: GreyPhotographs, gsd: fl
     standing = [view.position[2] for view in views] or positions_from(tile, scene.cameras)[:, 2]
     above = float(np.median(standing) - np.median(expected))
     low, high = float(expected.min()) - BELOW * above, float(expected.max()) + ABOVE * above
-    if len(views) < 2:
+    if len(views) < 2:  # then four standard errors span the heights that would be searched
         found = expected, np.full_like(expected, (high - low) / 4), np.zeros_like(expected)
     else:
         found = _matched(tile, choice, grey, max(1, round(tile.grid.cell / gsd)), expected, low, high)

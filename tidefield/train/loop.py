@@ -295,7 +295,8 @@ class SceneTrainer(Trainer):
         return error.detach(), tuple(parameter.grad for parameter in self.network.parameters())
 
     def draw_ahead(self) -> None:
-        if self.device.type == "cpu":  # which is not waited for meanwhile; after the last step it would be in vain
+        # A CPU has nothing to overlap it with, and the batch after the last step would be drawn for nothing.
+        if self.device.type == "cpu":
             return
         state = self.generator.get_state()
         self._ahead = state, self.draw()

@@ -122,13 +122,7 @@ def differential(
 ) -> Int64[np.ndarray, " K"]:
     """Indices of the positions of differential receivers that fit a model; none where they are too few to shape it."""
     good = np.flatnonzero(fit.used & (positions.stated_m < DIFFERENTIAL_M).all(axis=1))
-    return good if can_shape(positions.stated_m[fit.used], model.num_reg_images()) else good[:0]
-
-
-def can_shape(stated_m: Float64[np.ndarray, "N 2"], photographs: int) -> bool:
-    """Whether enough photographs of a model have positions with standard deviations of differential receivers."""
-    count = np.count_nonzero((stated_m < DIFFERENTIAL_M).all(axis=1))
-    return bool(count >= max(FEWEST_DIFFERENTIAL, photographs / 2))
+    return good if len(good) >= max(FEWEST_DIFFERENTIAL, model.num_reg_images() / 2) else good[:0]
 
 
 def hold_to_positions(model: pycolmap.Reconstruction, fit: PositionFit) -> tuple[str, ...]:

@@ -22,7 +22,12 @@ from tidefield.survey.georeference.gps_alignment import (
     fit_positions,
     given_positions,
 )
-from tidefield.survey.georeference.ground_control import adjust_to_control, fit_control, locate_marks
+from tidefield.survey.georeference.ground_control import (
+    adjust_to_control,
+    are_collinear,
+    fit_control,
+    locate_marks,
+)
 from tidefield.survey.io.gcp_file import refuse_elsewhere
 from tidefield.survey.survey import Photograph, Progress, Survey
 
@@ -67,7 +72,7 @@ def georeference(model: pycolmap.Reconstruction, survey: Survey, progress: Progr
         _transform(model, again.world_from_model)
         world_from_model, notes = again.world_from_model @ fit.world_from_model, (*notes, *again.notes)
         fit = fit_positions(model, photographs, positions, frame)
-    gross_errors = fit.left_out if fit else ()
+    gross_errors, has_part = fit.left_out if fit else (), fit is not None
 
     if control is not None:
         marks, unplaced = locate_marks(model, control, survey.photographs, frame)
@@ -77,6 +82,7 @@ def georeference(model: pycolmap.Reconstruction, survey: Survey, progress: Progr
         _transform(model, last)
         found = adjust_to_control(model, marks, agree, progress, fit if shaped else None)
         residuals, check, left_out = found.residuals, found.check, (*gross_errors, *unplaced, *found.rejected)
+        has_part = fit is not None and (shaped or are_collinear(marks.where(agree).points.values()))
         last, notes, used = found.moved @ last, (*notes, *shape, *found.notes), found.used_world
         if fit is None and positions.names:
             notes += (f"The positions of {list_names(positions.names)} are not used: {_why_unused(positions)}.",)
@@ -99,6 +105,7 @@ def georeference(model: pycolmap.Reconstruction, survey: Survey, progress: Progr
         left_out=left_out,
         notes=notes,
         control_world=used,
+        gps_has_part=has_part,
     )
 
 

@@ -23,10 +23,8 @@ CORRECTED_M = 0.5
 ROUNDING_M = 0.015
 """What a drone writes into EXIF and into XMP differs by less: by 1 cm in brighton_beach and turin_lot."""
 _LOWEST_M, _HIGHEST_M = -500.0, 9000.0  # the Dead Sea, and Mount Everest
-# Pix4D's namespace has the angles of a body with the camera beneath it, the others those of a gimbal (as
-# opendm/photo.py of OpenDroneMap also has it). Some makers may not follow it, so no photograph is left out for its
-# pitch alone.
-_ROLLS_TO_THE_LEFT = ("sensefly",)  # makers that count the roll the other way, by the same source
+_ROLLS_TO_THE_LEFT = ("sensefly",)
+"""Makers that count the roll of a body the other way (opendm/photo.py of OpenDroneMap)."""
 
 _RDF = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}"
 _PIX4D = "http://pix4d.com/camera/1.0"
@@ -89,6 +87,8 @@ class PhotographMetadata:
             # Drones without a gimbal write three zeros.
             if math.isfinite(yaw + pitch + roll) and any((yaw, pitch, roll)):
                 return yaw, pitch, roll
+        # Pix4D's namespace has the angles of a body with the camera beneath it (as opendm/photo.py of OpenDroneMap also
+        # has it). Some makers may not follow it, so no photograph is left out for its pitch alone.
         yaw, pitch, roll = (self.xmp_number(f"Camera:{name}") for name in ("Yaw", "Pitch", "Roll"))
         if self.text(ExifTags.Base.Make, "Make").casefold() in _ROLLS_TO_THE_LEFT:
             roll = -roll

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from types import EllipsisType
 
 import cv2
 import numpy as np
@@ -70,21 +71,15 @@ def measure(
         used: where the photograph is used, at any size; exposure and contrast are those of these pixels, or of all if
             there are none. None is everywhere.
     """
-
-    def of_used(values: np.ndarray) -> np.ndarray:
-        if used is None:
-            return values
-        share = cv2.resize(used * np.uint8(255), values.shape[1::-1], interpolation=cv2.INTER_AREA)
-        return values[share == 255] if share.max() == 255 else values
-
     grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)
     scale = min(1.0, THUMBNAIL_PX / max(grey.shape))
     size = max(16, round(grey.shape[1] * scale)), max(16, round(grey.shape[0] * scale))
     thumbnail = cv2.resize(grey.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-    low, high = np.percentile(of_used(thumbnail), (1, 99))
-    median, highlights = np.percentile(of_used(grey), (50, 95))
+    here, there = (_inside(used, image.shape) for image in (grey, thumbnail))
+    low, high = np.percentile(thumbnail[there], (1, 99))
+    median, highlights = np.percentile(grey[here], (50, 95))
     value = float(median) / 255  # to linear light (IEC 61966-2-1)
-    clipped = (of_used(pixels) >= _CLIPPED).sum(axis=-1, dtype=np.uint8)
+    clipped = (pixels[here] >= _CLIPPED).sum(axis=-1, dtype=np.uint8)
     measures = Measures(
         sharpness=sharpness(grey.astype(np.float32)),
         brightness=float(median),
@@ -96,6 +91,14 @@ def measure(
         sky=_sky(thumbnail) if used is None or used[0].mean() >= _SKY_COLUMNS else 0.0,
     )
     return measures, thumbnail
+
+
+def _inside(used: Bool[np.ndarray, "_ _"] | None, shape: tuple[int, ...]) -> np.ndarray | EllipsisType:
+    """Index of the pixels of an image of a shape that are used as a whole; of all if there are none."""
+    if used is None:
+        return ...
+    share = cv2.resize(used * np.uint8(255), shape[::-1], interpolation=cv2.INTER_AREA)
+    return share == 255 if share.max() == 255 else ...
 
 
 def sharpness(grey: Float32[np.ndarray, "H W"]) -> float:

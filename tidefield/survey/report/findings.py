@@ -19,9 +19,6 @@ from tidefield import __version__
 from tidefield.data.georeference import Georeference, Residuals
 from tidefield.geometry.geodesy import LocalFrame
 from tidefield.survey.colour import ExposureCorrection
-from tidefield.survey.georeference.bundle_adjustment import can_shape
-from tidefield.survey.georeference.gps_alignment import given_positions
-from tidefield.survey.georeference.ground_control import are_collinear
 from tidefield.survey.io.image_decoding import thumbnail
 from tidefield.survey.prepare import Prepared
 from tidefield.survey.sfm.features import decode_name
@@ -124,12 +121,8 @@ class Findings:
         gps = f"GPS of {len(used)} photographs"
         if located.source != "ground control":
             return gps if located.source == "GPS" else ""
-        # Positions have a part where control alone does not place the model, or where they have shaped it.
-        given = given_positions([p for p in self.survey.photographs if p.name in used])
-        shaped = can_shape(given.stated_m, self.reconstruction.num_reg_images())
-        has_part = used and (shaped or are_collinear(list(located.control_world)))
         count = len(located.control_world)
-        return f"{count} control point{'s'[: count != 1]}" + (f", {gps}" if has_part else "")
+        return f"{count} control point{'s'[: count != 1]}" + (f", {gps}" if used and located.gps_has_part else "")
 
     def comparisons(self) -> tuple[Comparison, ...]:
         """Residuals of GPS, control and check points, those that there are."""

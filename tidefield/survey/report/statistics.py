@@ -132,15 +132,20 @@ def measure(findings: Findings) -> Statistics:
 
 def find_flights(photographs: Sequence[Photograph]) -> Flights:
     """Sort photographs by time, or by name where times are missing; what two drones, or two cameras of a rig, took at
-    once are two flights."""
-    times = [photograph.time_s for photograph in photographs]
+    once are two flights.
+
+    A folder continues the flight that ended last before it, one of its own camera first.
+    """
     groups = by_camera(photographs)
-    if np.isfinite(times).all():
-        groups = sorted((sorted(own, key=times.__getitem__) for own in groups), key=lambda own: times[own[0]])
+    times = [photograph.time_s for photograph in photographs]
+    if not np.isfinite(times).all():
+        return (np.concatenate(groups).astype(np.int64),)
+    cameras = [(photograph.camera, photograph.serial) for photograph in photographs]
     found: list[list[int]] = []
-    for own in groups:
-        if found and not times[own[0]] < times[found[-1][-1]]:
-            found[-1] += own
+    for own in sorted((sorted(own, key=times.__getitem__) for own in groups), key=lambda own: times[own[0]]):
+        ended = [flight for flight in found if times[flight[-1]] <= times[own[0]]]
+        if ended:
+            max(ended, key=lambda one: (cameras[one[-1]] == cameras[own[0]], times[one[-1]])).extend(own)
         else:
             found.append(own)
     return tuple(np.array(own, dtype=np.int64) for own in found)

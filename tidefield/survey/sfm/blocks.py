@@ -26,6 +26,7 @@ from tidefield.geometry.halves import halves
 from tidefield.machine import cores
 from tidefield.processes import worker_processes
 from tidefield.survey.georeference.bundle_adjustment import adjustment_options, all_images, carry_over, thinned
+from tidefield.survey.io.positions import degrees_of
 from tidefield.survey.sfm.features import copy_photographs, decode_name, set_up_pycolmap
 from tidefield.survey.sfm.mapping import Mapper, write_models
 from tidefield.survey.sfm.model_files import model_files, read_model
@@ -95,8 +96,7 @@ def cut(
     located = [p for p in photographs if p.position is not None]
     if len(names) <= whole or 2 * len(located) < len(names):
         return [Block(tuple(names), ())]
-    degrees = np.array([(p.position.longitude_deg, p.position.latitude_deg) for p in located if p.position])
-    degrees[:, 0] = (degrees[:, 0] - degrees[0, 0] + 180) % 360 - 180  # all on one side of the date line
+    degrees = degrees_of(located)
     xy = degrees * [np.cos(np.radians(np.median(degrees[:, 1]))), 1.0]
     area = {located[i].name: k for k, members in enumerate(halves(xy, most)) for i in members}
     best: dict[str, list[tuple[int, str]]] = {name: [] for name in names}

@@ -275,18 +275,22 @@ def _map_globally(
 def large_enough(
     models: list[pycolmap.Reconstruction], database: Path, names: Collection[str]
 ) -> list[pycolmap.Reconstruction]:
-    """Select the models of three photographs or more from those of `find_models`, the largest first.
+    """Select the models of three photographs or more.
 
     Incremental mapping may return an early attempt, all of whose photographs are in a later one.
+
+    Args:
+        models: as `find_models` returns them, the largest first.
 
     Raises:
         SurveyError: there is none; with what the photographs lack.
     """
-    large: list[pycolmap.Reconstruction] = []
+    large, found = [], list[set[str]]()
     for model in models:
         own = set(registered_names(model))
-        if len(own) >= MIN_PHOTOGRAPHS and not any(own <= set(registered_names(other)) for other in large):
+        if len(own) >= MIN_PHOTOGRAPHS and not any(own <= other for other in found):
             large.append(model)
+            found.append(own)
     if not large:
         fit = models[0].num_reg_images() if models else 0
         reason = _why_so_few(database, {encode_name(name) for name in names})
