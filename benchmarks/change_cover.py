@@ -17,7 +17,7 @@ import numpy as np
 from benchmarks.change import store
 from benchmarks.change_pairs import stable_frame, write_surface
 from benchmarks.records import MEASURED, say
-from tidefield.change.cover import WINDOW_M, compare_cover
+from tidefield.change.cover import GAP_M, compare_cover
 from tidefield.change.measure import Options, measure
 from tidefield.change.surfaces import Grid, open_surface
 from tidefield.change.water import measure_water
@@ -108,7 +108,7 @@ def covered(flat: TidalFlat, seen: np.ndarray, extent: Extent) -> np.ndarray:
         seen: heights that are seen straight down, metres, as `TidalFlat.map` returns them.
     """
     plants = seen - _on(flat.surface, extent) > BARE_M
-    reach = round(WINDOW_M / extent.cell_m)
+    reach = round(GAP_M / extent.cell_m)
     window = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
     return cv2.morphologyEx(plants.astype(np.uint8), cv2.MORPH_CLOSE, window).astype(bool)
 

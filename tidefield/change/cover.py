@@ -1,11 +1,12 @@
 """Plants gained and lost, from the orthophotos of both surveys after correcting their exposures.
 
-A place is covered where its mean colour is greener than bare ground's by a margin, unless it lies in a patch that is as
-smooth as bare ground: green films and shallow water have no leaves that shade each other. Bare ground is the lowest of
-the common values of greenness, unless that is a plant's, as in a meadow. Areas come with the range that they have when
-the margin is moved by what greenness scatters from date to date over ground that is bare at both, and when patches,
-which are plants or none as a whole, are divided into rough and smooth ground; what changed by less than that scatter
-did not change.
+A place is covered where its mean colour is greener than bare ground's by a margin, and in small gaps between such
+places, unless it lies in a patch that is as smooth as bare ground: green films and shallow water have no leaves that
+shade each other. Bare ground is the lowest of the common values of greenness, unless that is a plant's, as in a meadow.
+Areas come with the range that they have when the margin is moved, also by what greenness scatters from date to date
+over ground that is bare at both, and when patches, which are plants or none as a whole, are divided into rough and
+smooth ground. Gained and lost are at least what is so with each of the margins, and at most what is so with any. What
+changed by less than that scatter did not change.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Int8, Int32, Int64, UInt8
 from scipy.ndimage import label
@@ -27,10 +29,19 @@ from tidefield.change.shift import picture_grid, read_picture
 from tidefield.change.surfaces import STRIP_CELLS, ChangeError, Grid
 from tidefield.maps.smoothing import smoothed
 
-MARGIN = 0.035
-"""Greenness above that of bare ground, chosen on built-in pairs 5 of vegetation and tidal_trees."""
-WINDOW_M = 0.4
-"""Deviation of the Gaussian window in which colours are averaged: tufts and the mud between them are one cover."""
+MARGIN = 0.065
+"""Greenness of plants above that of bare ground. This, `_SPAN` and `_LEAVES_M` were chosen on built-in pairs 5 to 8,
+100 to 102, 300 and 301 of vegetation, tidal_trees and river_mouths, by the areas of the plants that are drawn."""
+_SPAN = 1.5
+"""Areas have the range of margins that are this many times as large and as small."""
+_LEAVES_M = 0.2
+"""Deviation of the Gaussian window in which plants' colours are averaged: in wider ones patches grow at their edges."""
+GAP_M = 0.4
+"""Places that are at most so far from plants on all sides are covered: tufts and the mud between them are one cover."""
+_WINDOW_M = 0.4
+"""Deviation of the Gaussian window in which the colours of bare ground, and how rough it is, are averaged."""
+_BARE_MARGIN = 0.035
+"""Greenness in that window above that of bare ground, up to which ground is bare."""
 ROUGHER = 1.6
 """Variation of light in a patch of plants, over the lower quartile of bare ground's; chosen on pairs 5, 6, 300, 301."""
 ROUGH = 0.08
@@ -47,14 +58,14 @@ _GREENEST = 0.05
 """Greenness that bare ground has at most: grey has -0.13, and 0.06 in a picture with 20% more green."""
 _LEAST_BARE = 0.01
 """With a smaller share of the ground bare at both dates, light and scatter are those of all ground."""
-_FINE_M = 1.01 * WINDOW_M / 2
+_FINE_M = 1.01 * _LEAVES_M
 """Larger pixels do not show leaves; those of 20 cm do, which a conversion may make a little larger."""
 _UNKNOWN = np.int8(-128)
 
 
 @dataclass(frozen=True)
 class Area:
-    """An area in square metres, and the range it has when the margin is moved and patches are divided."""
+    """An area in square metres, and its range, as the module describes it."""
 
     value_m2: float
     low_m2: float
@@ -173,15 +184,16 @@ def compare_cover(
     Args:
         lights: means of each picture's light and of its square, where finer pixels show leaves that the grid's do not.
     """
-    sigma = max(0.8, WINDOW_M / grid.cell_m)
+    sigma, fine = (max(0.8, deviation / grid.cell_m) for deviation in (_WINDOW_M, _LEAVES_M))
     first = greenness(smoothed(earlier, known, sigma))
     second = greenness(smoothed(later, known, sigma))
     # Each date has its own white balance at first, so its own bare ground.
-    bare_ground = known & (first < _bare(first[known]) + MARGIN) & (second < _bare(second[known]) + MARGIN)
+    bare_ground = known & (first < _bare(first[known]) + _BARE_MARGIN) & (second < _bare(second[known]) + _BARE_MARGIN)
     gains = light_gains(earlier, later, _enough(bare_ground, known))
-    second = greenness(smoothed(with_light(later, gains), known, sigma))
+    evened = with_light(later, gains)
+    second = greenness(smoothed(evened, known, sigma))
     bare = _bare(np.concatenate([first[known], second[known]]))
-    bare_ground = known & (first < bare + MARGIN) & (second < bare + MARGIN)
+    bare_ground = known & (first < bare + _BARE_MARGIN) & (second < bare + _BARE_MARGIN)
     difference = (second - first)[_enough(bare_ground, known)]
     can_tell = _is_enough(bare_ground, known) and (lights is not None or grid.cell_m <= _FINE_M)
     rough = [np.ones_like(known)] * 2
@@ -194,16 +206,24 @@ def compare_cover(
     scatter /= math.sqrt(2)
     cell, areas, least = grid.cell_area_m2, {}, math.sqrt(2) * scatter
     clearly, classes = np.abs(second - first) > least, {}
+    first, second = (greenness(smoothed(picture, known, fine)) for picture in (earlier, evened))
     for k in (-1, 0, 1):
-        threshold = bare + MARGIN + k * scatter
-        before, after = (_plants(green > threshold, own, k) for green, own in zip((first, second), rough, strict=True))
+        threshold = bare + MARGIN * _SPAN**k + k * scatter
+        before, after = (
+            _plants(_closed(known & (green > threshold), GAP_M / grid.cell_m), own, k)
+            for green, own in zip((first, second), rough, strict=True)
+        )
         classes[k] = _classes(before, np.where(clearly, after, before), known, grid)
     for region in (None, *(regions or [])):
         name, where = ("all", known) if region is None else (region.name, region.cells(grid) & known)
         areas[name] = {}
+        here = [classes[k][where] for k in (0, -1, 1)]
         for what, codes in (("earlier", (-1, 2)), ("later", (1, 2)), ("gained", (1,)), ("lost", (-1,))):
-            sizes = [float(np.isin(classes[k][where], codes).sum()) * cell for k in (0, -1, 1)]
-            areas[name][what] = Area(sizes[0], min(sizes), max(sizes))
+            found = [np.isin(one, codes) for one in here]
+            whole, every, some = (
+                float(cells.sum()) * cell for cells in (found[0], np.all(found, axis=0), np.any(found, axis=0))
+            )
+            areas[name][what] = Area(whole, every, some)
     red, green, blue = (float(gain) for gain in gains)
     return Cover(grid, classes[0], (red, green, blue), bare, float(scatter), can_tell, float(known.sum()) * cell, areas)
 
@@ -231,6 +251,19 @@ def _rough(
     mean, square = np.moveaxis(smoothed(light, known, sigma), -1, 0)
     variation = np.sqrt(np.maximum(square - mean**2, 0)) / np.maximum(mean, 1)
     return variation > max(min(ROUGHER * float(np.quantile(variation[bare_ground], 0.25)), ROUGH), 1e-6)
+
+
+def _closed(region: Bool[np.ndarray, "rows columns"], radius: float) -> Bool[np.ndarray, "rows columns"]:
+    """Close a region's gaps by a disc of a radius in cells; beyond the edges everything is in the region."""
+    if radius < 1:
+        return region
+    near = _distance(~region) <= radius
+    return _distance(near) > radius
+
+
+def _distance(region: Bool[np.ndarray, "rows columns"]) -> Float32[np.ndarray, "rows columns"]:
+    """How far each cell of a region is from those outside of it, in cells."""
+    return cv2.distanceTransform(region.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
 
 
 def _plants(
