@@ -283,17 +283,15 @@ def _cover_tables(pairs: list[dict[str, Any]]) -> list[Table]:
         cells = []
         for what in ("earlier", "later", "gained", "lost"):
             area = of["cover"][what]
-            cells.append(
-                f"{area['value_m2']:.0f} ({area['low_m2']:.0f} to {area['high_m2']:.0f}); {area['true_m2']:.0f}"
-            )
+            cells.append(f"{_area(area)}; {area['true_m2']:.0f}")
         plants.append([name, *cells])
         line = of["water"]
         move, low, high = line["move_m"]
         water.append(
             [
                 name,
-                f"{line['land_gained_m2']:.0f}; {line['true_gained_m2']:.0f}",
-                f"{line['land_lost_m2']:.0f}; {line['true_lost_m2']:.0f}",
+                f"{_area(line['land_gained'])}; {line['true_gained_m2']:.0f}",
+                f"{_area(line['land_lost'])}; {line['true_lost_m2']:.0f}",
                 f"{move:+.2f} ({low:+.2f} to {high:+.2f})",
             ]
         )
@@ -305,7 +303,7 @@ def _cover_tables(pairs: list[dict[str, Any]]) -> list[Table]:
             plants,
         ),
         Table(
-            "Waterlines of built-in pairs after the tide fell 10 cm (m² found; true)",
+            "Waterlines of built-in pairs after the tide fell 10 cm (m² found and 95% interval; true)",
             ["pair", "fell dry", "came under water", "mean move seaward (m)"],
             water,
         ),
@@ -425,6 +423,10 @@ def _size_tables(found: dict[str, Any]) -> list[Table]:
         ["files written", f"{found['written_bytes'] / 1e9:.2f} GB"],
     ]
     return [Table(f"`tidefield change` on {found['million_cells']:.0f} million cells", ["", ""], rows)]
+
+
+def _area(area: dict[str, float]) -> str:
+    return f"{area['value_m2']:.0f} ({area['low_m2']:.0f} to {area['high_m2']:.0f})"
 
 
 def _volume(volume: dict[str, Any]) -> str:

@@ -92,9 +92,9 @@ def _pair(category: str, seed: int) -> dict[str, Any]:
         },
         "water": {
             "wet_m2": float(wet[0].sum()) * CELL_M**2,
-            "land_gained_m2": line.land_gained_m2,
+            "land_gained": vars(line.land_gained),
             "true_gained_m2": float(dried.sum()) * CELL_M**2,
-            "land_lost_m2": line.land_lost_m2,
+            "land_lost": vars(line.land_lost),
             "true_lost_m2": float(drowned.sum()) * CELL_M**2,
             "move_m": list(line.move_m),
         },

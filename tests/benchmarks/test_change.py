@@ -242,12 +242,13 @@ def test_parts_that_were_measured_are_on_the_page(tmp_path):
     record["size"]["date"] = "2020-02-02"
     (tmp_path / "change.json").write_text(json.dumps(record))
     area = {"value_m2": 10.0, "low_m2": 8.0, "high_m2": 12.0, "true_m2": 11.0}
-    water = {"land_gained_m2": 5.0, "true_gained_m2": 6.0, "land_lost_m2": 0.0, "true_lost_m2": 0.0}
+    water = {"land_gained": area, "true_gained_m2": 6.0, "land_lost": area, "true_lost_m2": 0.0}
     of = {"category": "vegetation", "seed": 1, "cover": dict.fromkeys(("earlier", "later", "gained", "lost"), area)}
     store(tmp_path, "cover", [of | {"water": water | {"move_m": [1.0, 0.5, 1.5]}}])
     write_page(tmp_path, tmp_path / "page.md")
     page = (tmp_path / "page.md").read_text()
     assert "10 (8 to 12); 11" in page
+    assert "| 10 (8 to 12); 6 | 10 (8 to 12); 0 |" in page
     assert "+1.00 (+0.50 to +1.50)" in page
     assert "3.00 GB" in page
     assert page.index("Measured on 20") < page.index("3.00 GB") < page.index("Measured on 2020-02-02, version")

@@ -121,7 +121,7 @@ def test_the_tide_is_no_change_of_the_ground(tmp_path: Path):
     assert any("are water at one date or both" in remark for remark in found.remarks)
     line = measure_water(found, (low, high), ()).waterline
     assert line is not None
-    assert line.land_lost_m2 == pytest.approx(100 * (high - low) / slope, rel=0.1)
+    assert line.land_lost.value_m2 == pytest.approx(100 * (high - low) / slope, rel=0.1)
     assert not any(word.startswith("Plants and water") for word in limits(found))
     dry = measure(*(replace(survey, classes=None) for survey in (one, two)), Options(shift="none"))
     assert dry.fill.value_m3 > 0.1 * flooded.sum() * 0.25

@@ -48,7 +48,8 @@ def test_the_waterline_moves_as_far_as_the_tide_fell_over_the_slope(tmp_path: Pa
     assert move == pytest.approx(0.2 / SLOPE, rel=0.1)
     assert low < 0.2 / SLOPE < high
     assert line.quantiles_m[1] == pytest.approx(0.2 / SLOPE, abs=0.7)
-    assert line.land_lost_m2 < 0.05 * line.land_gained_m2
+    assert line.land_lost.value_m2 < 0.05 * line.land_gained.value_m2
+    assert line.land_gained.low_m2 < 80 * 0.2 / SLOPE < line.land_gained.high_m2
     assert shapely.union_all(line.lines[0]).length == pytest.approx(80, rel=0.2)
 
 
@@ -87,7 +88,7 @@ def test_levels_are_in_the_unit_of_the_surveys_heights(dry: Change):
     assert metres.waterline is not None
     assert feet.waterline is not None
     assert feet.waterline.levels_m == pytest.approx((1.5, 1.4))
-    assert feet.waterline.land_gained_m2 == pytest.approx(metres.waterline.land_gained_m2, rel=0.01)
+    assert feet.waterline.land_gained.value_m2 == pytest.approx(metres.waterline.land_gained.value_m2, rel=0.01)
     assert feet.below[0].earlier_m2 == pytest.approx(metres.below[0].earlier_m2, rel=0.01)
 
 
@@ -106,7 +107,7 @@ def test_a_waterline_at_one_date_only_has_not_moved_by_any_length(dry: Change):
     assert line.lines[0]
     assert not line.lines[1]
     assert np.isnan([*line.move_m, *line.quantiles_m]).all()
-    assert line.land_gained_m2 == pytest.approx(75 * 80, rel=0.03)
+    assert line.land_gained.value_m2 == pytest.approx(75 * 80, rel=0.03)
     [words] = water_words(replace(measure_water(dry, (1.5, -3.0), ()), waterline=line))
     assert "no waterline" in words
-    assert "fell dry, 0.00 m² came under water" in words
+    assert "fell dry, 0.00 m² (0.00 to 0.00) came under water" in words

@@ -65,7 +65,7 @@ _UNKNOWN = np.int8(-128)
 
 @dataclass(frozen=True)
 class Area:
-    """An area in square metres, and its range, as the module describes it."""
+    """An area in square metres, and its range."""
 
     value_m2: float
     low_m2: float

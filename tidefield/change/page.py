@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from tidefield.change.cover import Cover
+from tidefield.change.cover import Area, Cover
 from tidefield.change.errors import colour_limit
 from tidefield.change.figures import (
     HIGHER,
@@ -128,15 +128,15 @@ def cover_words(cover: Cover | None) -> list[str]:
     """Plants gained and lost, in a sentence."""
     if cover is None:
         return []
-    of = cover.areas["all"]
-
-    def area(what: str) -> str:
-        return f"{cubic(of[what].value_m2)} m² ({cubic(of[what].low_m2)} to {cubic(of[what].high_m2)})"
-
+    area = {what: _area(found) for what, found in cover.areas["all"].items()}
     return [
-        f"Plants covered {area('earlier')} of {cubic(cover.known_m2)} m² at the earlier date and {area('later')} at "
-        f"the later one; {area('gained')} were gained, {area('lost')} lost."
+        f"Plants covered {area['earlier']} of {cubic(cover.known_m2)} m² at the earlier date and {area['later']} at "
+        f"the later one; {area['gained']} were gained, {area['lost']} lost."
     ]
+
+
+def _area(found: Area) -> str:
+    return f"{cubic(found.value_m2)} m² ({cubic(found.low_m2)} to {cubic(found.high_m2)})"
 
 
 def water_words(water: Water | None) -> list[str]:
@@ -145,18 +145,16 @@ def water_words(water: Water | None) -> list[str]:
         return []
     words = []
     line = water.waterline
-    if line is not None and not all(line.lines):
-        words.append(
-            f"There is no waterline at these heights of the water at both dates: {cubic(line.land_gained_m2)} m² fell "
-            f"dry, {cubic(line.land_lost_m2)} m² came under water."
-        )
-    elif line is not None:
-        move, low, high = line.move_m
-        words.append(
-            f"The waterline moved {number(abs(move), 1)} m {'seaward' if move > 0 else 'landward'} on average (95%, "
-            f"seaward: {number(low, 1)} to {number(high, 1)} m): {cubic(line.land_gained_m2)} m² fell dry, "
-            f"{cubic(line.land_lost_m2)} m² came under water."
-        )
+    if line is not None:
+        changed = f"{_area(line.land_gained)} fell dry, {_area(line.land_lost)} came under water."
+        if all(line.lines):
+            move, low, high = line.move_m
+            words.append(
+                f"The waterline moved {number(abs(move), 1)} m {'seaward' if move > 0 else 'landward'} on average "
+                f"(95%, seaward: {number(low, 1)} to {number(high, 1)} m): {changed}"
+            )
+        else:
+            words.append(f"There is no waterline at these heights of the water at both dates: {changed}")
     for below in water.below:
         words.append(
             f"Below {number(below.level_m, 2)} m lay {cubic(below.earlier_m2)} m², then {cubic(below.later_m2)} m²: "

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float32
 from scipy.ndimage import maximum_filter, minimum_filter, uniform_filter
 from scipy.spatial import KDTree
 
-from tidefield.change.cover import small_patches
+from tidefield.change.cover import Area, small_patches
 from tidefield.change.errors import Z95
 from tidefield.change.measure import Change
 from tidefield.change.surfaces import Grid
@@ -28,6 +28,9 @@ _SMOOTH = 5
 """Cells along each side of the window whose mean height is compared with a level."""
 _LEAST_M2 = 10.0
 """Smaller pools and islands are left out of the waterlines."""
+_SCATTER = 2.0
+"""Deviations of a cell's error above its level up to which ground is wet; chosen on built-in pairs 5 to 8, 100 and 101
+of vegetation, tidal_trees and river_mouths."""
 _BAND = 3.0
 """Deviations of a cell's error: cells so near a level, at either date, decide where its line is."""
 _STEP_M = 1.0
@@ -63,7 +66,7 @@ class Waterline:
         levels_m: of the water, in the earlier survey's heights.
         lines: of both dates, in map coordinates.
         wet: cells under water at one date or both.
-        land_gained_m2, land_lost_m2: dry at one date only.
+        land_gained, land_lost: dry at one date only, with 95% intervals of the later heights near the level.
         move_m: mean move towards the water (positive: the land grew), and its 95% interval; NaN where one date has no
             line.
         quantiles_m: 5, 50 and 95% of the distances of the later line's points from the earlier line, with that sign;
@@ -73,8 +76,8 @@ class Waterline:
     levels_m: tuple[float, float]
     lines: tuple[Lines, Lines]
     wet: Bool[np.ndarray, "rows columns"]
-    land_gained_m2: float
-    land_lost_m2: float
+    land_gained: Area
+    land_lost: Area
     move_m: tuple[float, float, float]
     quantiles_m: tuple[float, float, float]
 
@@ -94,13 +97,17 @@ class Water:
             else {
                 "levels_m": list(line.levels_m),
                 "lengths_m": [sum(part.length for part in lines) for lines in line.lines],
-                "land_gained_m2": line.land_gained_m2,
-                "land_lost_m2": line.land_lost_m2,
+                **_ends("land_gained", line.land_gained),
+                **_ends("land_lost", line.land_lost),
                 **dict(zip(("move_m", "move_low_m", "move_high_m"), map(_known, line.move_m), strict=True)),
                 "quantiles_m": [_known(value) for value in line.quantiles_m],
             },
             "below": [vars(of) for of in self.below],
         }
+
+
+def _ends(name: str, area: Area) -> dict[str, float]:
+    return {f"{name}_m2": area.value_m2, f"{name}_low_m2": area.low_m2, f"{name}_high_m2": area.high_m2}
 
 
 def _known(value: float) -> float | None:
@@ -168,30 +175,30 @@ def _waterline(change: Change, earlier: np.ndarray, later: np.ndarray, levels: t
     step = 1 + math.isqrt(grid.rows * grid.columns // _MOST_CELLS)
     thin = grid.thinned(step)
     known = np.isfinite(earlier)
-    # Heights of water scatter around its level: what is above by no more than a cell's error is wet, too.
-    margin = change.detection_m[1] / Z95 / math.sqrt(2)
-    wet = [
-        _without_specks((h < level + margin) & known, known, grid)
-        for h, level in zip((earlier, later), levels, strict=True)
-    ]
-    lines = [_edges(w[::step, ::step], known[::step, ::step], thin) for w in wet]
-    gained, lost = (float((wet[a] & ~wet[b]).sum()) * grid.cell_area_m2 for a, b in ((0, 1), (1, 0)))
-    length = float(np.mean([sum(part.length for part in part_of) for part_of in lines]))
-    if not all(lines):
-        nothing = (math.nan, math.nan, math.nan)
-        return Waterline(levels, (lines[0], lines[1]), wet[0] | wet[1], gained, lost, nothing, nothing)
+    # Heights of water scatter around its level: what is above by no more than this is wet, too.
+    margin = _SCATTER * change.detection_m[1] / Z95 / math.sqrt(2)
     half = Z95 * _level_error(change, earlier, later, levels)
-    dry = [(later >= levels[1] + margin + move) & known for move in (-half, 0.0, half)]
-    spread = [float(d.sum() - dry[1].sum()) * grid.cell_area_m2 / length for d in dry]
-    move = (gained - lost) / length
+    before, *after = (
+        _without_specks((heights < level + margin) & known, known, grid)
+        for heights, level in ((earlier, levels[0]), *((later, levels[1] + by) for by in (0.0, -half, half)))
+    )
+    wet = (before, after[0])
+    lines = [_edges(w[::step, ::step], known[::step, ::step], thin) for w in wet]
+    gained = [float((before & ~w).sum()) * grid.cell_area_m2 for w in after]
+    lost = [float((w & ~before).sum()) * grid.cell_area_m2 for w in after]
+    moves = (math.nan, math.nan, math.nan)
+    if all(lines):
+        length = float(np.mean([sum(part.length for part in part_of) for part_of in lines]))
+        move, high, low = ((more - less) / length for more, less in zip(gained, lost, strict=True))
+        moves = move, low, high
     return Waterline(
         levels,
         (lines[0], lines[1]),
-        wet[0] | wet[1],
-        gained,
-        lost,
-        (move, move + spread[2], move + spread[0]),
-        _distances(lines[0], lines[1], wet[0], grid),
+        before | after[0],
+        Area(gained[0], min(gained), max(gained)),
+        Area(lost[0], min(lost), max(lost)),
+        moves,
+        _distances(lines[0], lines[1], before, grid),
     )
 
 
