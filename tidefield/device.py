@@ -52,7 +52,7 @@ def _has_all(device: torch.device) -> bool:
             padding_mode="border",
             align_corners=False,
         )
-        index, rows = torch.zeros(1, 2, dtype=torch.long, device=device), torch.zeros(2, 4, device=device)
+        index, rows = torch.zeros(1, 2, dtype=torch.int32, device=device), torch.zeros(2, 4, device=device)
         embedding_bag(index, rows, per_sample_weights=torch.ones(1, 2, device=device), mode="sum")
     except (NotImplementedError, RuntimeError):
         return False

@@ -383,6 +383,18 @@ def test_photographs_without_exif_take_no_exposure_or_time_from_the_others(
     ]
 
 
+def test_frames_of_a_video_follow_each_other_by_their_numbers(tmp_path: Path):
+    from PIL import Image
+
+    paths = sorted(tmp_path / f"frame_{k}.png" for k in range(1, 13))
+    for path in paths:
+        Image.new("RGB", (8, 8)).save(path)
+    clock = exposure.exposure_and_clock(read_exposures(paths), 12)[1]
+    order = [paths[k].stem for k in np.argsort(clock)]
+    assert order == [f"frame_{k}" for k in range(1, 13)]
+    assert np.isnan(read_exposures(paths[4:]).time_s).all(), "they are in order already"
+
+
 def test_a_photograph_without_exif_counts_as_those_before_and_after_it():
     log_exposure, time_s = np.arange(5.0), 1e9 + 2 * np.arange(5.0)
     whole = exposure.exposure_and_clock(Exposures(log_exposure, time_s), 5)

@@ -4,6 +4,7 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -26,7 +27,8 @@ from shared_data import SHARED
 
 from tidefield.data.georeference import read_georeference
 from tidefield.data.images import read_at_size
-from tidefield.data.load import at_twice_the_size, at_width, load_scene
+from tidefield.data.load import at_twice_the_size, at_width, load_scene, own_lens
+from tidefield.data.pictures import read_header
 from tidefield.data.scene import Scene
 from tidefield.errors import SceneError
 from tidefield.geometry.lenses import rectify
@@ -163,6 +165,59 @@ def test_the_layouts_own_split_is_kept(tmp_path: Path) -> None:
     assert {scene.names[i] for i in scene.train} == set(truth.names[:5])
     assert {scene.names[i] for i in scene.test} == set(truth.names[7:])
     assert len(scene.names) == 7
+
+
+@pytest.mark.parametrize("form", ["no folder", "no suffix", "elsewhere"])
+def test_a_split_means_frames_by_shorter_and_longer_paths(form: str, tmp_path: Path) -> None:
+    truth = survey(PINHOLE)
+    files = {
+        "no folder": list(truth.names),
+        "no suffix": [f"images/{name}".removesuffix(".png") for name in truth.names],
+        "elsewhere": [f"/home/me/images_2/{name}" for name in truth.names],
+    }[form]
+    write_transforms(tmp_path, truth, train_filenames=files[:7], test_filenames=files[7:])
+    scene = load_scene(tmp_path)
+    assert {scene.names[i] for i in scene.test} == set(truth.names[7:])
+    assert len(scene.train) == 7
+
+
+def test_a_split_of_photographs_that_no_frame_has_is_refused(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    truth = survey(PINHOLE)
+    files = [f"images/{name}" for name in truth.names]
+    write_transforms(tmp_path, truth, train_filenames=files, test_filenames=["other/x.png"])
+    with pytest.raises(SceneError, match=r"transforms\.json lists other/x\.png for training or testing, which none of"):
+        load_scene(tmp_path)
+    assert load_scene(tmp_path, allow_missing=True).test == (0, 8)
+    assert "lists other/x.png for training or testing, which none of its frames has: left out" in caplog.text
+    assert "every eighth is held out" in caplog.text
+
+
+def test_other_models_of_colmap_are_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    truth = survey(PINHOLE)
+    parts = [replace(truth, **{f: getattr(truth, f)[:3] for f in ("names", "lenses", "T_world_camera", "pictures")})]
+    for number, part in enumerate([*parts, truth]):
+        write_colmap(tmp_path, part, place=f"sparse/{number}")
+    assert len(load_scene(tmp_path).names) == 3
+    assert "has several COLMAP models, which are not connected: 0 is used, not 1; if another has more" in caplog.text
+
+
+def test_photographs_may_be_larger_than_a_camera_of_rounded_size(tmp_path: Path) -> None:
+    for camera, size in (((1000, 667), (6000, 4000)), ((800, 533), (6000, 4000)), ((1600, 1067), (5472, 3648))):
+        Image.new("L", size).save(tmp_path / "a.png")
+        lens = PINHOLE.resized(*camera)
+        assert own_lens(tmp_path / "a.png", lens)[0].width == size[0]
+        with pytest.raises(SceneError, match="or the same aspect"):
+            own_lens(tmp_path / "a.png", replace(lens, height=lens.height + 4))
+
+
+def test_a_tiff_of_other_bands_is_to_be_converted(tmp_path: Path) -> None:
+    rasterio = pytest.importorskip("rasterio")
+    path = tmp_path / "a.tif"
+    place = rasterio.Affine(1, 0, 5, 0, -1, 5)
+    with rasterio.open(path, "w", "GTiff", 8, 6, 3, dtype="uint16", transform=place) as file:
+        file.write(np.ones((3, 6, 8), np.uint16))
+    with pytest.raises(SceneError, match="expected 8 bits per colour, in grey or in red, green and blue; convert it"):
+        read_header(path)
 
 
 @pytest.mark.parametrize("folder", ["", "card/images/"])
@@ -401,6 +456,32 @@ def test_transparent_photographs_of_any_layout_get_a_white_background(tmp_path: 
     scene = load_scene(tmp_path)
     assert scene.background_rgb == (1.0, 1.0, 1.0)
     assert (scene.photographs[scene.index(truth.names[2])][:10] == 255).all()
+
+
+def test_transparent_corners_of_all_photographs_are_no_background(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Sparse points lie behind those of other photographs, unlike behind what surrounds an object."""
+    caplog.set_level(logging.INFO)
+    truth, (v, u) = survey(PINHOLE), np.mgrid[:48, :64]
+    corners = np.where(np.hypot(u - 31.5, v - 23.5) > 34, 0, 255).astype(np.uint8)
+    clear = replace(truth, pictures=tuple(np.dstack([picture, corners]) for picture in truth.pictures))
+    write_colmap(tmp_path / "ground", clear)
+    scene = load_scene(tmp_path / "ground")
+    assert scene.background_rgb is None
+    assert scene.hull is None
+    assert (scene.photographs.used(1).numpy() == (corners > 0)).mean() > 0.98
+    assert "photo_4.png and 4 more are not used, as if they were masked" in caplog.text
+    # Of an object, every photograph shows the same points.
+    uv = [PINHOLE.project((truth.ground - pose[:, 3]) @ pose[:, :3]) for pose in truth.T_world_camera]
+    around = [np.zeros((48, 64), np.uint8) for _ in uv]
+    thing = np.hypot(*truth.ground[:, :2].T) < 2
+    for alpha, pixels in zip(around, uv, strict=True):
+        for x, y in pixels[thing]:
+            cv2.circle(alpha, (round(x), round(y)), 2, 255, -1)
+    cut = replace(truth, pictures=tuple(np.dstack([*own]) for own in zip(truth.pictures, around, strict=True)))
+    write_colmap(tmp_path / "thing", cut)
+    assert load_scene(tmp_path / "thing").background_rgb == (1.0, 1.0, 1.0)
 
 
 def test_transparent_pixels_of_some_photographs_alone_are_masked(

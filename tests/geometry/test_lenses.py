@@ -89,6 +89,16 @@ def test_unusable_calibrations_are_refused() -> None:
             lens_from_colmap("SIMPLE_PINHOLE", 320, 240, bad)
 
 
+def test_corners_that_lie_beyond_the_fold_before_they_are_corrected_have_rays() -> None:
+    lens = Lens(1000, 750, 250.0, 250.0, 500.0, 375.0, k1=0.3, k2=-0.05, k3=-0.005)
+    r = np.linspace(0, 3, 30001)
+    distorted = r * (1 + lens.k1 * r**2 + lens.k2 * r**4 + lens.k3 * r**6)
+    fold = int(np.argmax(distorted))
+    assert r[fold] < 0.98 * distorted[fold], "such points are tried"
+    xy = lens.undistort(np.column_stack([distorted[: fold - 300 : 100], np.zeros(len(r[: fold - 300 : 100]))]))
+    np.testing.assert_allclose(xy[:, 0], r[: fold - 300 : 100], atol=1e-9)
+
+
 def test_pixels_beyond_the_fold_of_a_lens_have_no_ray() -> None:
     folded = Lens(800, 600, 400.0, 400.0, 400.0, 300.0, k1=-0.3)
     # r - 0.3 r^3 is greatest at r = 1/sqrt(0.9), where it is 0.7027.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
@@ -105,7 +106,7 @@ def render(options: Render, console: Console) -> None:
             for file in write_still(made, out, about=describe_view(scene, own), overwrite=overwrite):
                 console.print(str(file), highlight=False, soft_wrap=True)
             return
-        width, height = _size(scene.cameras[scene.train[0]], options.width, options.height)
+        width, height = _size(scene.cameras[_usual(scene)], options.width, options.height)
         from tidefield.model.renderer import in_turn
         from tidefield.render.video import write_video
 
@@ -128,6 +129,13 @@ def render(options: Render, console: Console) -> None:
                 progress=lambda done: bar(done, len(cameras)),
             )
     console.print(f"{out}: {len(cameras)} frames", highlight=False, soft_wrap=True)
+
+
+def _usual(scene: Scene) -> int:
+    """A training photograph of the most frequent size: one may be upright, or a thumbnail."""
+    sizes = {i: tuple(scene.cameras.size_px[i].tolist()) for i in scene.train}
+    [(most, _)] = Counter(sizes.values()).most_common(1)
+    return next(i for i, size in sizes.items() if size == most)
 
 
 def _resized(cameras: Cameras, width: int | None, height: int | None) -> Cameras:

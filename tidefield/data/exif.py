@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -124,7 +125,8 @@ def read_exposures(paths: Sequence[Path]) -> Exposures:
     """Read exposures and capture times from the EXIF of photographs, without decoding pixels.
 
     A factor of the exposure that some of the photographs lack is left out for all, because it cannot be compared; those
-    that have none at all have no exposure. Damaged EXIF counts as absent.
+    that have none at all have no exposure. Damaged EXIF counts as absent. Where none has a time, but numbers that are
+    not as long as each other (frames of a video), their order by these counts as seconds.
 
     Raises:
         SceneError: a file does not exist or is not an image.
@@ -138,6 +140,8 @@ def read_exposures(paths: Sequence[Path]) -> Exposures:
     shared = there[there.any(axis=1)].all(axis=0)
     log_exposure = terms[:, shared].sum(axis=1) if shared.any() else np.full(len(found), math.nan)
     time_s = np.array([exif.time_s for exif in found], dtype=np.float64)
+    if np.isnan(time_s).all() and (rank := _order_of_numbers(paths)) is not None:
+        time_s = rank
     lacking = [np.isnan(values) for values in (log_exposure, time_s) if not np.isnan(values).all()]
     if count := np.any(lacking, axis=0).sum():
         _log.info(
@@ -146,3 +150,19 @@ def read_exposures(paths: Sequence[Path]) -> Exposures:
             len(found),
         )
     return Exposures(log_exposure, time_s)
+
+
+def _order_of_numbers(paths: Sequence[Path]) -> Float64[np.ndarray, " V"] | None:
+    """The rank of each file, sorted by names, with numbers in these as numbers; None if they are not sorted, or that is
+    their order already."""
+
+    def parts(k: int) -> list[tuple[bool, int, str]]:
+        found = re.findall(r"[0-9]+|[^0-9]+", paths[k].as_posix())
+        return [(part.isdecimal(), int(part[-18:]) if part.isdecimal() else 0, part) for part in found]
+
+    order = sorted(range(len(paths)), key=parts)
+    if order == list(range(len(paths))) or list(paths) != sorted(paths):
+        return None
+    rank = np.empty(len(paths))
+    rank[order] = np.arange(len(paths))
+    return rank

@@ -12,13 +12,16 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Float64, Int, UInt8
 from torch import Tensor
 from torch.nn import functional as F
 
 from tidefield.data.images import Photographs
+from tidefield.data.readers.posed import Observations
 from tidefield.geometry.cameras import Cameras, pixel_grid
+from tidefield.geometry.lenses import Lens
 
 RESOLUTION, ROUNDS = 32, 3
 """Voxels along the sides of the box while it is fitted to the hull, and how many times it is."""
@@ -30,6 +33,11 @@ LEAST_SEEN, LEAST_SHARE = 3, 0.3
 """A voxel must lie in the frames of so many silhouettes, and of this share of them: others are hardly constrained. Each
 part of an object that is larger than the frames is in some of them only."""
 STEPS_PER_VOXEL = 1.5
+MOST_POINTS, FEWEST_POINTS = 2000, 20
+"""Sparse points that tell an object from photographs with transparent margins: as many as are tried, and as suffice."""
+MARGIN_SHARE = 0.25
+"""Points of an object fall on transparent pixels of other photographs less often than this share of chance."""
+_CLEAR = 128  # opacity below which a pixel is transparent
 
 
 @dataclass(frozen=True)
@@ -53,6 +61,55 @@ class Hull:
         inside = ((index >= 0) & (index < size)).all(-1)
         x, y, z = index.clamp(min=0).minimum(size - 1).unbind(-1)
         return self.filled[x, y, z] & inside
+
+
+def is_background(
+    points: Observations,
+    T_world_camera: Float64[np.ndarray, "V 3 4"],
+    pinholes: Sequence[Lens],
+    photographs: Photographs,
+    train: Sequence[int],
+) -> bool:
+    """Whether transparent pixels are what lies behind an object, and not margins of photographs that show everything.
+
+    No photograph is transparent where it has an object's point in its frame, whether or not that is hidden; behind the
+    margins, by contrast, there is ground that others show. True where too few points tell.
+
+    Args:
+        points: with observations, in the world of the poses.
+        pinholes: the cameras of the photographs, at their size.
+        photographs: with alphas.
+        train: indices of the training photographs.
+    """
+    used = np.unique(points.point_index)
+    used = used[:: -(-len(used) // MOST_POINTS) or 1]
+    row = np.full(len(points.xyz_world), -1)
+    row[used] = np.arange(len(used))
+    in_frame, clear = np.zeros((2, len(used), len(train)), bool)
+    shown, chance = np.zeros(len(used), bool), []
+    for k, i in enumerate(train):
+        alpha = photographs.alpha(i)
+        if alpha is None:
+            continue
+        R, centre = T_world_camera[i, :, :3], T_world_camera[i, :, 3]
+        xyz = (points.xyz_world[used] - centre) @ R
+        front = xyz[:, 2] > 0
+        uv = np.full((len(used), 2), -1.0)
+        lens = pinholes[i]
+        uv[front] = xyz[front, :2] / xyz[front, 2:] * (lens.fx, lens.fy) + (lens.cx, lens.cy)
+        height, width = alpha.shape
+        in_frame[:, k] = front & (uv >= 0).all(axis=1) & (uv < (width, height)).all(axis=1)
+        u, v = uv[in_frame[:, k]].astype(np.int64).T
+        is_clear = (alpha < _CLEAR).numpy()
+        clear[in_frame[:, k], k] = is_clear[v, u]
+        chance.append(float(is_clear.mean()))
+        seen = row[points.point_index[points.photograph_index == i]]
+        seen = seen[seen >= 0]
+        shown[seen] |= in_frame[seen, k] & ~clear[seen, k]
+    # Points that are observed on transparent pixels alone may be of what was cut off.
+    if int(shown.sum()) < FEWEST_POINTS:
+        return True
+    return bool(clear[shown].sum() <= MARGIN_SHARE * float(np.mean(chance)) * in_frame[shown].sum())
 
 
 def visual_hull(cameras: Cameras, photographs: Photographs, train: Sequence[int]) -> Hull | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -18,7 +17,7 @@ from tidefield.data.calibrate import calibrate_lenses
 from tidefield.data.exif import read_exposures
 from tidefield.data.exposure import estimate_gains, observe
 from tidefield.data.holdout import read_holdout
-from tidefield.data.hull import Hull, visual_hull
+from tidefield.data.hull import Hull, is_background, visual_hull
 from tidefield.data.images import PhotographFile, Photographs, Progress, is_used, open_photographs, photographs_key
 from tidefield.data.near_far import estimate_near_far
 from tidefield.data.pictures import read_header
@@ -27,7 +26,7 @@ from tidefield.data.readers.files import naming, read_json, reading
 from tidefield.data.readers.llff import SUFFIXES, read_llff
 from tidefield.data.readers.opensfm import find_opensfm, read_opensfm
 from tidefield.data.readers.posed import Observations, PosedPhotographs, proper_rotations
-from tidefield.data.readers.transforms import read_blender, read_split, read_transforms
+from tidefield.data.readers.transforms import find_listed, read_blender, read_split, read_transforms
 from tidefield.data.scene import Scene, SparsePoints
 from tidefield.data.shading import directional_shading, estimate_shading
 from tidefield.data.triangulate import find_points, triangulate_again
@@ -92,8 +91,6 @@ LAYOUTS = (
 )
 """In this order; the first one found is read. A new layout is a line here and its reader in data/readers/."""
 _FEWEST = 3
-_IMAGES = re.compile(r"(?:^|(?<=/))images(?:_\d+)?/")
-"""Folder of the photographs in a path, in their own size or a smaller one; also one within it may be named so."""
 _SMALLEST_WIDTH = 16
 _WHITE = (1.0, 1.0, 1.0)
 DOUBLED_BYTES = 4e9
@@ -146,6 +143,8 @@ def load_scene(
     transparent = [alpha is not None and bool((alpha < 255).any()) for alpha in photographs.alphas]
     # An object before a background is cut out in every photograph: others have pixels that are not to be used.
     cut_out = any(transparent) and (posed.background_rgb is not None or all(transparent[i] for i in train))
+    if cut_out and posed.background_rgb is None and posed.points is not None and len(posed.points.uv_px):
+        cut_out = is_background(posed.points, posed.T_world_camera, pinholes, photographs, train)
     if any(transparent) and not cut_out:
         some = [path.name for path, own in zip(posed.paths, transparent, strict=True) if own]
         _log.info(f"transparent pixels of {list_names(some)} are not used, as if they were masked")
@@ -371,13 +370,8 @@ def _split_beside(root: Path, names: tuple[str, ...]) -> tuple[frozenset[str], f
     split = read_split(read_json(file), file)
     if split is None:
         return None
-    there = frozenset(names)
-
-    def name_in(path: str) -> str | None:
-        rests = (path[found.end() :] for found in _IMAGES.finditer(path))
-        return next((name for name in (path, *rests) if name in there), None)
-
-    train, test = (there & {name_in(path) for path in part} for part in split)
+    found = find_listed(split[0] | split[1], names)
+    train, test = (frozenset(name for path in part if (name := found[path]) is not None) for part in split)
     if train and test and len(train) + len(test) == len(names):
         return train, test
     _log.warning(f"{file} has a split of other photographs than the COLMAP model next to it: every eighth is held out")
@@ -391,7 +385,8 @@ def own_lens(path: Path, lens: LensModel) -> tuple[LensModel, bool]:
         SceneError: the file cannot be read, or its aspect differs from the lens's.
     """
     own_width, own_height, has_alpha = read_header(path)
-    if abs(own_height - lens.height * own_width / lens.width) > 1:  # one pixel: halves of odd sizes are rounded
+    # One pixel of the smaller size, where a half may have been rounded.
+    if abs(own_height - lens.height * own_width / lens.width) > max(1.0, own_width / lens.width):
         turned = " (is it stored rotated? EXIF orientation is not applied)" if own_width < own_height else ""
         raise SceneError(
             f"{path} has {own_width} x {own_height} pixels, but its camera has {lens.width} x {lens.height}: expected "

@@ -129,7 +129,15 @@ class LensModel(ABC):
         """
         if not self.is_distorted:
             return xy_distorted.copy()
-        xy = xy_distorted.astype(np.float64)
+        xy = self._newton(xy_distorted, xy_distorted)
+        # Where distortion lengthens, the start may lie beyond the fold of points within it.
+        if (lost := np.isnan(xy).any(axis=1)).any():
+            xy[lost] = self._newton(0.5 * xy_distorted[lost], xy_distorted[lost])
+        return xy
+
+    def _newton(self, start: Points, xy_distorted: Points) -> Points:
+        """`undistort` from a start."""
+        xy = start.astype(np.float64)
         with np.errstate(all="ignore"):  # points without a solution diverge; they become NaN below
             for _ in range(50):
                 residual = self.distort(xy) - xy_distorted

@@ -7,6 +7,7 @@ in the images file, so rigs and frames are not needed.
 
 from __future__ import annotations
 
+import logging
 import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -19,9 +20,10 @@ from jaxtyping import Float64, Int
 from tidefield.data.readers.files import in_range, inside, keep_present, naming, opened
 from tidefield.data.readers.masks import masks_beside
 from tidefield.data.readers.posed import Observations, PosedPhotographs
-from tidefield.errors import SceneError
+from tidefield.errors import SceneError, list_names
 from tidefield.geometry.lenses import COLMAP_MODELS, COLMAP_PARAMETERS, LensModel, lens_from_colmap
 
+_log = logging.getLogger(__name__)
 _NO_POINT = -1
 _OBSERVATION = np.dtype([("uv", "<f8", 2), ("point", "<i8")])
 _POINT = np.dtype([("id", "i8"), ("xyz", "f8", 3), ("rgb", "u1", 3)])
@@ -53,6 +55,7 @@ def read_colmap(root: Path, model: Path, allow_missing: bool) -> PosedPhotograph
     """
     suffix = _suffix(model)
     assert suffix is not None, "find_colmap found no model here"
+    _warn_of_others(model)
     cameras_file, images_file, points_file = (model / f"{stem}{suffix}" for stem in ("cameras", "images", "points3D"))
     is_binary = suffix == ".bin"
     with opened(cameras_file, _EXPECTED, _MEGABYTES) as file, naming(cameras_file):
@@ -79,6 +82,18 @@ def read_colmap(root: Path, model: Path, allow_missing: bool) -> PosedPhotograph
         points=_observations(images, points),
         masks=masks,
     )
+
+
+def _warn_of_others(model: Path) -> None:
+    """COLMAP writes parts of a survey that nothing connects into folders 0, 1, ...; the first may be the smallest."""
+    others = sorted(
+        path.name for path in model.parent.iterdir() if path != model and path.name.isdigit() and _suffix(path)
+    )
+    if model.name.isdigit() and others:
+        _log.warning(
+            f"{model.parent} has several COLMAP models, which are not connected: {model.name} is used, not "
+            f"{list_names(others)}; if another has more photographs, rename its folder to {model.name}"
+        )
 
 
 def _suffix(model: Path) -> str | None:

@@ -12,9 +12,11 @@ Blender scenes have one file per part, `transforms_{train,val,test}.json`, and p
 from __future__ import annotations
 
 import json
+import logging
 import math
 import posixpath
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,7 +28,7 @@ from tidefield.data.pictures import read_header
 from tidefield.data.ply import read_ply, write_ply
 from tidefield.data.readers.files import LARGEST, inside, keep_present, naming, number, parsing, read_json
 from tidefield.data.readers.posed import Observations, PosedPhotographs
-from tidefield.errors import SceneError
+from tidefield.errors import SceneError, list_names
 from tidefield.files import completed_file
 from tidefield.geometry.lenses import FisheyeLens, Lens, LensModel
 
@@ -34,6 +36,9 @@ from tidefield.geometry.lenses import FisheyeLens, Lens, LensModel
 # 6 at a radius of 4.
 _BLENDER_NEAREST, _BLENDER_FARTHEST = 0.5, 1.5
 _WHITE = (1.0, 1.0, 1.0)
+_IMAGES = re.compile(r"(?:^|(?<=/))images(?:_\d+)?/")
+"""Folder of the photographs in a path, in their own size or a smaller one; also one within it may be named so."""
+_log = logging.getLogger(__name__)
 _FILE, _CLOUD = "transforms.json", "sparse_pc.ply"
 _MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
 _FISHEYE = "OPENCV_FISHEYE"
@@ -53,6 +58,8 @@ def read_transforms(root: Path, allow_missing: bool) -> PosedPhotographs:
     file = root / _FILE
     top = read_json(file)
     split = read_split(top, file)
+    if split is not None:
+        split = _split_of_frames(split, _frames(top, file), file, allow_missing)
     keys, posed = _photographs(top, root, file, allow_missing, split and (split[0] | split[1]))
     if split is not None:
         named = dict(zip(keys, posed.names, strict=True))
@@ -95,13 +102,8 @@ def _photographs(
     top: Mapping[str, Any], root: Path, file: Path, allow_missing: bool, wanted: frozenset[str] | None = None
 ) -> tuple[list[str], PosedPhotographs]:
     """The photographs of a description, or those wanted of them, and the normalised `file_path` of each."""
-    frames = top.get("frames")
-    if not isinstance(frames, list) or not all(
-        isinstance(frame, dict) and isinstance(frame.get("file_path"), str) for frame in frames
-    ):
-        raise SceneError(f"{file} has no list of frames with a file_path each: export it again")
     found = []
-    for frame in frames:
+    for frame in _frames(top, file):
         path, as_png = (inside(root, frame["file_path"] + suffix, file) for suffix in ("", ".png"))
         # The suffix may be missing for PNG. r_0.5 may be a name without a suffix: the existing file decides.
         path = path if path.is_file() or (path.suffix and not as_png.is_file()) else as_png
@@ -121,6 +123,16 @@ def _photographs(
         T_world_camera=_poses([frame for _, _, frame in found], file),
         masks=_masks([frame for _, _, frame in found], root, file, allow_missing),
     )
+
+
+def _frames(top: Mapping[str, Any], file: Path) -> list[Mapping[str, Any]]:
+    """The frames of a description, each with a file_path."""
+    frames = top.get("frames")
+    if not isinstance(frames, list) or not all(
+        isinstance(frame, dict) and isinstance(frame.get("file_path"), str) for frame in frames
+    ):
+        raise SceneError(f"{file} has no list of frames with a file_path each: export it again")
+    return frames
 
 
 def _masks(frames: Sequence[Mapping[str, Any]], root: Path, file: Path, allow_missing: bool) -> tuple[Path | None, ...]:
@@ -203,6 +215,40 @@ def read_split(top: Mapping[str, Any], file: Path) -> tuple[frozenset[str], froz
     train, test, val = (_listed(top, f"{part}_filenames", file) for part in ("train", "test", "val"))
     test = test or val
     return (train, test - train) if train and test else None
+
+
+def find_listed(listed: Iterable[str], names: Iterable[str]) -> dict[str, str | None]:
+    """Find which of these names each listed path means: the same path, or the same below a folder of images in one size
+    or another; without suffixes where these differ. None if it means none of them."""
+    by_form: dict[str, str] = {}
+    for name in names:
+        for form in _forms(name):
+            by_form.setdefault(form, name)
+    return {path: next((by_form[form] for form in _forms(path) if form in by_form), None) for path in listed}
+
+
+def _forms(path: str) -> list[str]:
+    whole = [path, *(path[found.end() :] for found in _IMAGES.finditer(path))]
+    return whole + [posixpath.splitext(one)[0] for one in whole]
+
+
+def _split_of_frames(
+    split: tuple[frozenset[str], frozenset[str]], frames: Sequence[Mapping[str, Any]], file: Path, allow_missing: bool
+) -> tuple[frozenset[str], frozenset[str]] | None:
+    """A split in the file paths of frames; None, with a warning, if frames of one part are missing altogether."""
+    found = find_listed(split[0] | split[1], [posixpath.normpath(frame["file_path"]) for frame in frames])
+    if unknown := sorted(path for path, name in found.items() if name is None):
+        lists = f"{file} lists {list_names(unknown)} for training or testing, which none of its frames has"
+        if not allow_missing:
+            raise SceneError(
+                f"{lists}: expected their file paths; correct the lists, or leave these out with --allow-missing"
+            )
+        _log.warning(f"{lists}: left out")
+    train, test = (frozenset(name for path in part if (name := found[path]) is not None) for part in split)
+    if train and test:
+        return train, test - train
+    _log.warning(f"{file} has frames of only one part of its split: every eighth is held out")
+    return None
 
 
 def _listed(top: Mapping[str, Any], key: str, file: Path) -> frozenset[str]:
