@@ -100,6 +100,33 @@ def test_cells_without_heights_are_not_heights(tmp_path: Path, nodata: tuple[flo
     assert all(f"{value:g}" in remarks[0] for value in undeclared)
 
 
+@pytest.mark.parametrize("value", [-9999.0, 0.0])
+def test_overviews_do_not_hide_what_is_no_height(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, value: float):
+    """Those of a COG are smooth, so that there are values between the heights and it, and beyond it."""
+    from rasterio.shutil import copy
+
+    monkeypatch.setattr("tidefield.change.nodata._SAMPLE", 250)
+    values = plane(600, 600, 0.05) + np.float32(50)
+    y, x = np.mgrid[:600, :600]
+    values[np.hypot(x - 300, y - 300) > 250] = value
+    copy(write_surface(tmp_path / "a.tif", values), tmp_path / "cog.tif", driver="COG")
+    for name in ("a.tif", "cog.tif"):
+        surface = open_surface(tmp_path / name)
+        assert any(f"{value:g} where no height can be, in 45" in remark for remark in surface.remarks)
+        assert np.nanmin(read(tmp_path / name, common_grid([surface]))) > 45
+
+
+def test_small_holes_are_found_wherever_they_lie(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("tidefield.change.nodata._SAMPLE", 10)
+    monkeypatch.setattr("tidefield.change.nodata._STRIP_CELLS", 1000)
+    values = plane(100, 100, 0.5) + np.float32(50)
+    values[6:9, 41:44] = -9999
+    path = write_surface(tmp_path / "a.tif", values)
+    surface = open_surface(path)
+    assert any("-9999 where no height can be, in 0.1% of its cells" in remark for remark in surface.remarks)
+    assert np.isnan(read(path, common_grid([surface]))[6:9, 41:44]).all()
+
+
 @pytest.mark.parametrize("declared", [None, -9999.0])
 def test_a_mask_holds_besides_what_stands_for_no_height(tmp_path: Path, declared: float | None):
     import rasterio

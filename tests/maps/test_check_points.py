@@ -103,6 +103,19 @@ def test_errors_are_those_of_the_surface_and_of_the_marks(scene: Scene, frame: M
     assert remark(30) == "30 check points"
 
 
+def test_marks_in_photographs_from_one_place_place_nothing(scene: Scene, frame: MapFrame, tmp_path: Path):
+    write_check_points(control(scene), tmp_path)
+    point = read_check_points(tmp_path / CHECK_FILE, scene, frame)[0]
+    (first, (u, v)), (second, _), *_ = point.marks
+    assert np.isfinite(_intersected(point, scene, frame)).all()
+    poses = scene.cameras.T_world_camera.clone()
+    poses[second] = poses[first]
+    poses[second, 0, 3] += 0.05
+    hovering = replace(scene, cameras=replace(scene.cameras, T_world_camera=poses))
+    near = replace(point, marks=((first, (u, v)), (second, (u + 0.5, v))))
+    assert np.isnan(_intersected(near, hovering, frame)).all()
+
+
 def test_marks_are_of_the_photographs_as_they_were_taken(tmp_path: Path):
     """Twice as wide as the scene's, and distorted by their lens."""
     truth = disk.survey(disk.BARREL)

@@ -19,7 +19,7 @@ from tidefield.maps.cloud import cloud_writer
 from tidefield.maps.contours import contours, interval_of, read_reduced, write_contours
 from tidefield.maps.grid import LOCAL_WKT, Grid, MapFrame
 from tidefield.maps.rasters import Raster, raster_writer, read_raster
-from tidefield.maps.sections import cut, write_sections
+from tidefield.maps.sections import cut, draw, write_sections
 from tidefield.maps.terrain import coarse_ground, hillshade, write_hillshade, write_terrain
 from tidefield.maps.vectors import lost_in_geojson
 
@@ -291,6 +291,7 @@ def test_sections_interpolate_and_end_where_the_map_ends(tmp_path: Path, monkeyp
     low, height, high = (float(first.rsplit(",", 4)[k]) for k in (3, 1, 4))
     assert (height - low, high - height) == (pytest.approx(0.98, abs=1e-3), pytest.approx(0.98, abs=1e-3))
     assert plot.read_text().lstrip().startswith("<?xml")
+    assert len(draw([section] * 30, "m", "m").axes) == 24
     # Names are texts: no formulas to spreadsheets, no mathematics to the plot.
     write_sections([replace(section, name='=HYPERLINK("a$^$b")')], tmp_path, "m", "m")
     assert table.read_text().splitlines()[1].startswith("\"'=HYPERLINK(")

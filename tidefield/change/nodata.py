@@ -9,11 +9,12 @@ from typing import Any
 from xml.sax.saxutils import escape
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float64
 from scipy.ndimage import binary_dilation, label
 
 _SAMPLE = 1000
-"""Rows and columns that are read of a large surface to see what its values are."""
+"""Rows and columns of a large surface that are compared with each other to see what its values are."""
+_STRIP_CELLS = 1 << 22
 _SENTINELS = (-10000.0, -9999.0, -99999.0, -32768.0, -32767.0, 9999.0, 1e20)
 """Values that programs write where they know no height; some do not declare them."""
 IMPOSSIBLE_M = 20_000.0
@@ -38,15 +39,10 @@ def undeclared(dataset: Any, metres: float) -> tuple[list[float], float, float]:
     Returns:
         the values; their share of cells; the share of zeros that may be levelled water, or no heights.
     """
-    height, width = min(_SAMPLE, dataset.height), min(_SAMPLE, dataset.width)
-    raw = dataset.read(1, out_shape=(height, width), masked=True)
-    values = raw.filled(0).astype(np.float64)
-    known = ~np.ma.getmaskarray(raw) & np.isfinite(values)
-    if dataset.nodata is not None:
-        known &= ~np.isclose(values, dataset.nodata)  # the lowest float is often declared with fewer digits
-    scale, offset = dataset.scales[0], dataset.offsets[0]
-    floats, found = np.issubdtype(raw.dtype, np.floating), []
     sentinels = (*_SENTINELS, float(np.finfo(np.float32).min))
+    values, known, count = _sampled(dataset, sentinels)
+    scale, offset = dataset.scales[0], dataset.offsets[0]
+    floats, found = np.issubdtype(np.dtype(dataset.dtypes[0]), np.floating), []
     possible = np.abs(values * scale + offset) * metres <= IMPOSSIBLE_M
     others = values[known & possible & ~np.isin(values, sentinels)]
     # Where many heights are lower and many higher, as 9.999 m in millimetres may be, it is one of them.
@@ -55,8 +51,9 @@ def undeclared(dataset: Any, metres: float) -> tuple[list[float], float, float]:
         # Whole numbers with a scale reach some of these values; where others are declared they may be heights.
         unlikely = floats or abs(value * scale + offset) * metres > _UNLIKELY_M
         among = low <= value <= high
-        if (unlikely or dataset.nodata is None) and not among and (known & (values == value)).any():
+        if (unlikely or dataset.nodata is None) and not among and count[value]:
             found.append(value)
+    share = sum(count[value] for value in found) / (dataset.width * dataset.height)
     zero, heights = known & (values == 0), known & (values != 0) & ~np.isin(values, found)
     doubtful = 0.0
     if offset == 0 and heights.any():
@@ -72,7 +69,36 @@ def undeclared(dataset: Any, metres: float) -> tuple[list[float], float, float]:
             doubtful = float(zero.mean())
     far, cells = np.unique(values[known & ~possible & ~np.isin(values, found)], return_counts=True)
     found += far[np.argsort(-cells)[:_MOST_FAR]].tolist()
-    return found, float((known & np.isin(values, found)).mean()), doubtful
+    others_found = [value for value in found if value not in count]
+    return found, share + float((known & np.isin(values, others_found)).mean()), doubtful
+
+
+def _sampled(
+    dataset: Any, sentinels: tuple[float, ...]
+) -> tuple[Float64[np.ndarray, "rows columns"], Bool[np.ndarray, "rows columns"], dict[float, int]]:
+    """Values on a lattice of cells, whether each may be known, and how many of all cells have each sentinel.
+
+    All cells are read: small holes lie between those of a lattice, and overviews mix the values at the edges of holes.
+    """
+    rows, columns = (
+        ((np.arange(min(_SAMPLE, size)) + 0.5) * size / min(_SAMPLE, size)).astype(int)
+        for size in (dataset.height, dataset.width)
+    )
+    values, known = np.zeros((len(rows), len(columns))), np.zeros((len(rows), len(columns)), bool)
+    count = dict.fromkeys(sentinels, 0)
+    step = max(1, _STRIP_CELLS // dataset.width)
+    for first in range(0, dataset.height, step):
+        raw = dataset.read(1, window=((first, min(first + step, dataset.height)), (0, dataset.width)), masked=True)
+        strip = raw.filled(0).astype(np.float64)
+        there = ~np.ma.getmaskarray(raw) & np.isfinite(strip)
+        if dataset.nodata is not None:
+            there &= ~np.isclose(strip, dataset.nodata)  # the lowest float is often declared with fewer digits
+        for value in sentinels:
+            count[value] += int(np.count_nonzero(there & (strip == value)))
+        mine = (rows >= first) & (rows < first + step)
+        inner = np.ix_(rows[mine] - first, columns)
+        values[mine], known[mine] = strip[inner], there[inner]
+    return values, known, count
 
 
 def _at_edges(region: Bool[np.ndarray, "rows columns"]) -> Bool[np.ndarray, "rows columns"]:

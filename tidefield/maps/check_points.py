@@ -31,6 +31,8 @@ log = logging.getLogger(__name__)
 ENOUGH = 30
 """Fewest check points for a statement of accuracy (ASPRS, Positional Accuracy Standards, edition 2, 2023)."""
 _ELLIPSOID = "ellipsoid"
+_LEAST_DEG = 2.0
+"""Angle between two rays from which on their intersection is a place: half a pixel is less than a few pixels then."""
 _SAME_POINT_M = 0.02
 """Two points are not surveyed nearer to each other, and one that is rounded or converted is not farther off."""
 _SAME_NAME_M = 1.0
@@ -225,7 +227,7 @@ def check(
 
 
 def _intersected(point: CheckPoint, scene: Scene, frame: MapFrame) -> Float64[np.ndarray, "3"]:
-    """Intersect the rays of a point's marks by least distance in pixels; NaN with fewer than two marks."""
+    """Intersect the rays of a point's marks by least distance in pixels; NaN where no two are `_LEAST_DEG` apart."""
     import torch
 
     if len(point.marks) < 2:
@@ -235,6 +237,8 @@ def _intersected(point: CheckPoint, scene: Scene, frame: MapFrame) -> Float64[np
     uv = torch.tensor([[xy] for _, xy in point.marks]).float()
     ray = cameras.directions_world(uv)[:, 0].double().numpy()
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    if np.degrees(np.arccos((ray @ ray.T).clip(-1, 1).min())) < _LEAST_DEG:
+        return np.full(3, np.nan)
     position = cameras.position_world.double().numpy()
     across = np.eye(3) - ray[:, :, None] * ray[:, None]
     weight = (cameras.focal_px.mean(1).double().numpy()) ** 2

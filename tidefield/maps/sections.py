@@ -20,6 +20,7 @@ from tidefield.maps.rasters import sample
 BAND = 1.96
 """Standard errors on both sides of a height that hold 95% of normal errors."""
 MOST_POINTS = 100_000
+_MOST_DRAWN = 24
 
 
 @dataclass(frozen=True)
@@ -74,9 +75,10 @@ def write_sections(sections: Sequence[Section], folder: Path, unit: str, unit_up
 
 
 def draw(sections: Sequence[Section], unit: str, unit_up: str) -> Any:
-    """Draw sections below each other, with 95% bands."""
+    """Draw sections below each other, with 95% bands; the first `_MOST_DRAWN` of many."""
     from matplotlib.figure import Figure
 
+    sections = sections[:_MOST_DRAWN]
     figure = Figure(figsize=(9, 1 + 2.4 * len(sections)), layout="constrained")
     axes = figure.subplots(len(sections), 1, squeeze=False)[:, 0]
     for one, plot in zip(sections, axes, strict=True):
