@@ -50,11 +50,11 @@ class OpenRun:
     """
 
     def __init__(self, folder: Path, device: str) -> None:
-        run = read_run(folder)
+        run, where = read_run(folder), choose_device(device)  # before photographs are read, which may take minutes
         self.folder, self.config = folder, run.config
         self.scene: Scene = load_scene(scene_of(folder, run), width=run.width)
         self._stack = ExitStack()
-        trained = methods.trained(folder, run, self.scene, choose_device(device))
+        trained = methods.trained(folder, run, self.scene, where)
         self._render, progress = self._stack.enter_context(trained)
         self.steps = progress.step
 

@@ -235,6 +235,21 @@ def test_commits_are_those_of_training_and_of_evaluation(tmp_path: Path) -> None
     )
 
 
+def test_results_of_installed_packages_are_named_beside_those_of_sources(tmp_path: Path) -> None:
+    file = tmp_path / "a.json"
+    for scene in ("fern", "lego"):
+        keep_result(file, scene, "tidefield", 24.0)
+    record = read_json(file) or {}
+    for result, commit in zip(record["results"], ("1234567890", None), strict=True):
+        result["evaluation"]["commit"] = result["process"]["train"]["commit"] = commit
+    write_json(file, record)
+    (commits,) = code_and_machines(read_figures([file], table.SCENES, names()))
+    assert commits.endswith("1234567 (tidefield of fern); an installed package (tidefield of lego).")
+    record["results"][0]["evaluation"]["commit"] = record["results"][0]["process"]["train"]["commit"] = None
+    write_json(file, record)
+    assert code_and_machines(read_figures([file], table.SCENES, names())) == []
+
+
 def test_a_page_of_a_gpu_says_what_ran_on_the_processor(tmp_path: Path) -> None:
     for device, expected in (("cpu", False), ("cuda:0", True)):
         file = tmp_path / f"{device}.json"

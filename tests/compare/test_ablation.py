@@ -164,6 +164,10 @@ def test_without_other_seeds_small_differences_are_noise(flats: Scene):
     own = {"tidefield": 30.0, "views-2": 30.04, "degree-0": 30.06}
     (table,) = ablation_tables(results(flats, {"flats": own}))
     assert [row[2] for row in table.rows] == ["30.00", "+0.04, noise", "+0.06"]
+    better, within, seeds = summarise(results(flats, {"flats": own}))
+    assert better == "Better, and nowhere worse: degree-0."
+    assert within == "Within 0.05 dB on all scenes, so that no effect was measured: views-2."
+    assert seeds.startswith("All were trained with one seed")
 
 
 def test_a_variant_of_a_variant_is_compared_with_that_one(flats: Scene):

@@ -195,9 +195,12 @@ def test_a_worker_of_a_cluster_returns_what_failed():
     def work(name: str) -> None:
         if name == "a":
             raise Unfinished("it broke", [failure])
+        if name == "c":
+            raise RunError("s3://flats did not answer")
 
     with _with_failures(lambda: nullcontext(work)) as tried:
         assert (tried("a"), tried("b")) == ([failure], ())
+        assert tried("c") == [Failure("c", "s3://flats did not answer", 2)]
 
 
 def test_flats_are_made_by_another_process_than_the_one_that_measures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

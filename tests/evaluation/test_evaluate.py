@@ -171,6 +171,39 @@ def test_an_evaluation_that_dies_leaves_no_older_report_beside_its_pictures(tmp_
     assert not list(tmp_path.glob("*evaluation*"))
 
 
+@pytest.mark.parametrize("changed", [False, True])
+def test_an_interrupted_evaluation_goes_on_unless_something_else_is_evaluated(tmp_path, monkeypatch, changed):
+    monkeypatch.setattr(module, "commit", lambda: None)
+    scene, rendered = wall.scene(wall.cameras(6), test=(1, 3, 4)), []
+
+    def counted(camera: Cameras) -> Rendering:
+        rendered.extend(camera.names)
+        if camera.names == ("04.jpg",) and rendered.count("04.jpg") == 1:
+            raise KeyboardInterrupt
+        return darker(camera)
+
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(counted, scene, tmp_path, configuration={"steps": 1}, console=quiet())
+    (tmp_path / "renderings" / "01.png").unlink()
+    steps = {"steps": 2 if changed else 1}
+    found = evaluate(counted, scene, tmp_path, configuration=steps, console=quiet())
+    assert rendered[3:] == (["01.jpg", "03.jpg", "04.jpg"] if changed else ["01.jpg", "04.jpg"])
+    whole = evaluate(darker, scene, tmp_path / "whole", configuration=steps, console=quiet())
+    assert found.mean == whole.mean
+    assert list(found.report["per_photograph"]) == ["01.jpg", "03.jpg", "04.jpg"]
+    assert found.report.get("of_an_interrupted_evaluation") == (None if changed else 2)
+    assert not (tmp_path / "measured_so_far.json").exists()
+    evaluate(counted, scene, tmp_path, configuration=steps, console=quiet(), overwrite=True)
+    assert rendered[-3:] == ["01.jpg", "03.jpg", "04.jpg"]
+
+
+def test_an_evaluation_of_another_split_leaves_no_pictures_of_the_former(tmp_path):
+    for test in ((1, 3), (2,)):
+        scene = wall.scene(wall.cameras(5), test=test)
+        evaluate(darker, scene, tmp_path, configuration={}, console=quiet(), overwrite=True)
+    assert [path.name for path in (tmp_path / "renderings").iterdir()] == ["02.png"]
+
+
 def test_renderings_and_labelled_pictures_are_written(scene, tmp_path):
     evaluate(darker, scene, tmp_path, configuration={}, console=quiet())
     with Image.open(tmp_path / "renderings" / "01.png") as picture:

@@ -16,7 +16,7 @@ from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from tidefield.commands.common import AnyMethod, Cluster, Device, OpensplatProgram, Verbosity
 from tidefield.config import Budget, checked_seed
-from tidefield.errors import RunError
+from tidefield.errors import RunError, TidefieldError
 from tidefield.files import require_writable
 from tidefield.methods import METHODS
 from tidefield.processes import worker_processes
@@ -201,7 +201,7 @@ def _with_failures(
     opened: Callable[[], AbstractContextManager[Callable[[str], object]]],
 ) -> Iterator[Callable[[str], Sequence[Failure]]]:
     """What `scene_runner` opens, as a function that returns what failed: an error would end the other scenes, too."""
-    from tidefield.compare.run import Unfinished
+    from tidefield.compare.run import Failure, Unfinished
 
     with opened() as work:
 
@@ -210,6 +210,8 @@ def _with_failures(
                 work(name)
             except Unfinished as error:
                 return error.failures
+            except TidefieldError as error:
+                return [Failure(name, str(error), 2)]
             return ()
 
         yield tried

@@ -87,14 +87,16 @@ def summarise(results: Results) -> list[str]:
         beyond = found - {WITHIN}
         if found and len(beyond) < 2:
             groups.setdefault(next(iter(beyond), WITHIN), []).append(name)
+    within = f"{LEAST_DB:g} dB" + ("" if noise is None else f" or the noise ({CONFIDENCE:.0%})")
     sentences = {
         "worse": "Worse, and nowhere better",
         "better": "Better, and nowhere worse",
-        WITHIN: f"Within {LEAST_DB:g} dB or the noise ({CONFIDENCE:.0%}) on all scenes, so that no effect was measured",
+        WITHIN: f"Within {within} on all scenes, so that no effect was measured",
     }
     found = [f"{sentence}: {', '.join(groups[effect])}." for effect, sentence in sentences.items() if effect in groups]
     if noise is None:
-        return found
+        once = "All were trained with one seed: how far trainings are apart is not known, and a difference may be that."
+        return [*found, once] if found else []
     return [
         *found,
         f"The noise, {noise.psnr:.3f} dB of a training, is how far those with other seeds are apart "

@@ -10,6 +10,7 @@ from tidefield.compare.run import STEPS
 
 Record = Mapping[str, Any]
 """What `tidefield.machine.describe` returned, of one step of a result or of a benchmark."""
+_INSTALLED = "an installed package"
 
 
 def records_of(results: Results) -> list[tuple[str, Record]]:
@@ -24,13 +25,13 @@ def records_of(results: Results) -> list[tuple[str, Record]]:
 
 def code_and_machines(results: Results) -> list[str]:
     """Which commit and which machine measured what: code, and what a minute brings, are not the same on all of them."""
-    commits = _groups({k: commit for k, one in results.by.items() if (commit := _commit_of(one))})
+    commits = _groups({k: _commit_of(one) for k, one in results.by.items()})
     machines = _groups({k: machine for k, one in results.by.items() if (machine := _machine_of(one))})
 
     def each(groups: Mapping[str, str]) -> str:
         return "; ".join(f"{label} ({of})" for label, of in groups.items())
 
-    sentences = [f"Measured at commit {commit}." for commit in commits]
+    sentences = [f"Measured at commit {commit}." for commit in commits if commit != _INSTALLED]
     if len(commits) > 1:
         sentences = [f"Measured at different commits, whose code and settings differ: {each(commits)}."]
     if len(machines) > 1:
@@ -45,10 +46,10 @@ def short(commit: object) -> str:
     return str(commit)[:7] + "+" * str(commit).endswith("+")
 
 
-def _commit_of(result: Result) -> str | None:
-    """The code that a result was measured with; None where nothing was recorded."""
+def _commit_of(result: Result) -> str:
+    """The code that a result was measured with: only sources have a commit."""
     found = {"train": result.process.get("train", {}).get("commit"), "evaluate": result.evaluation.get("commit")}
-    return _of_steps({step: short(commit) for step, commit in found.items() if commit})
+    return _of_steps({step: short(commit) for step, commit in found.items() if commit}) or _INSTALLED
 
 
 def _machine_of(result: Result) -> str | None:

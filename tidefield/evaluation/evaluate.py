@@ -5,11 +5,13 @@ A method is only a function `render(camera) -> Rendering` here, so every method 
 
 from __future__ import annotations
 
+import json
 import math
 import re
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from statistics import fmean
@@ -26,7 +28,7 @@ from tidefield.data.holdout import FILE_NAME as HOLDOUT_FILE
 from tidefield.data.scene import Scene, poses_key
 from tidefield.data.surface import doubly_seen
 from tidefield.errors import RunError
-from tidefield.evaluation import EVALUATION_FILE
+from tidefield.evaluation import EVALUATION_FILE, UNFINISHED_FILE
 from tidefield.evaluation.lpips import Lpips, download_lpips_weights, load_lpips, prepare_torchvision, too_large
 from tidefield.evaluation.metrics import METRICS, SUFFIXES, Image8, flip_map, score
 from tidefield.evaluation.panels import Panel, Scale, colours, depth_panel, side_by_side
@@ -66,7 +68,7 @@ def evaluate(
     """Render every held-out photograph's camera, measure the metrics, and print a table.
 
     Writes `out/renderings/NAME.png`, `out/pictures/NAME.png` (ground truth | rendering | error | depth) and, last and
-    complete, `out/evaluation.json`.
+    complete, `out/evaluation.json`. What an interrupted evaluation of the same method and scene has done is kept.
 
     Args:
         render: the method.
@@ -87,7 +89,6 @@ def evaluate(
         raise RunError(f"{scene.root} holds no photograph out: expected at least one to compare with; add photographs")
     files = picture_names([scene.names[i] for i in scene.test])
     delete_partials(path, *(out / folder / file for folder in FOLDERS for file in files))
-    photographs: dict[str, dict[str, Any]] = {}
     if download_lpips:
         if unusable := prepare_torchvision():
             raise RunError(f"--download-lpips was given, but {unusable}: expected what can use the weights; install it")
@@ -98,11 +99,26 @@ def evaluate(
         metric: network if isinstance(network, str) else too_large(metric, width, height) or network
         for metric, network in load_lpips().items()
     }
+    made_of = {
+        "split": {"train": [scene.names[i] for i in scene.train], "test": [scene.names[i] for i in scene.test]},
+        "width": int(scene.cameras.size_px[list(scene.test), 0].max()),
+        "version": __version__,
+        "commit": commit(),
+        "protocol": PROTOCOL,
+        "poses": poses_key(scene.names, scene.cameras.T_world_camera, scene.held_out),
+        "held_out_of_poses": (scene.root / HOLDOUT_FILE).exists(),
+        "lpips_weights": {metric: n.sha256 for metric, n in networks.items() if isinstance(n, Lpips)},
+        "configuration": dict(configuration),
+    }
+    photographs = _unfinished(out, made_of)
+    continued = len(photographs)
     with ProgressBar(console, "Evaluating") as bar:
         for index, file in zip(scene.test, files, strict=True):
+            if scene.names[index] in photographs and all((out / folder / file).is_file() for folder in FOLDERS):
+                continue
             rendering, seconds = _timed(render, scene, index)
             if not photographs:
-                delete_files(out, [path])  # an older one is not of the pictures that follow
+                delete_evaluation(out, ())  # an older one is not of the pictures that follow
             image, truth = to_8_bit(rendering.colour).cpu(), scene.photographs[index]
             used = scene.photographs.used(index)
             seen = doubly_seen(scene, scene.cameras[index]) & used
@@ -114,7 +130,9 @@ def evaluate(
                 "seconds": seconds,
             }
             _write_pictures(out, file, image, truth, rendering)
+            write_json(out / UNFINISHED_FILE, {**made_of, "per_photograph": photographs})
             bar(len(photographs), len(scene.test))
+    photographs = {scene.names[i]: photographs[scene.names[i]] for i in scene.test}
     seconds_in_all = sum(row["seconds"] for row in photographs.values())
     report = {
         "per_photograph": photographs,
@@ -122,17 +140,11 @@ def evaluate(
         "rays_per_second": int(scene.cameras.size_px[list(scene.test)].prod(1).sum()) / seconds_in_all,
         "seconds_per_frame": seconds_in_all / len(photographs),
         **_peak_memory(),
-        "split": {"train": [scene.names[i] for i in scene.train], "test": [scene.names[i] for i in scene.test]},
-        "width": int(scene.cameras.size_px[list(scene.test), 0].max()),
-        "version": __version__,
-        "commit": commit(),
-        "protocol": PROTOCOL,
-        "poses": poses_key(scene.names, scene.cameras.T_world_camera, scene.held_out),
-        "held_out_of_poses": (scene.root / HOLDOUT_FILE).exists(),
-        "lpips_weights": {metric: n.sha256 for metric, n in networks.items() if isinstance(n, Lpips)},
-        "configuration": dict(configuration),
+        **made_of,
+        **({"of_an_interrupted_evaluation": continued} if continued else {}),
     }
     write_json(path, report)
+    delete_files(out, [out / UNFINISHED_FILE])
     console.print(_table(scene, report))
     for remark in _remarks(report, out):
         console.print(remark, soft_wrap=True)
@@ -141,13 +153,27 @@ def evaluate(
 
 def delete_evaluation(out: Path, names: Sequence[str]) -> None:
     """Delete an evaluation, its pictures, and those that one of these photographs, ended before its end, has left."""
-    report = read_json(out / EVALUATION_FILE)
-    listed = report.get("per_photograph") if isinstance(report, dict) else None
-    names = [*names, *(listed if isinstance(listed, dict) else ())]
+    reports = [out / EVALUATION_FILE, out / UNFINISHED_FILE]
+    for file in reports:
+        with suppress(RunError):  # what is damaged is deleted, too
+            report = read_json(file)
+            listed = report.get("per_photograph") if isinstance(report, dict) else None
+            names = [*names, *(listed if isinstance(listed, dict) else ())]
     pictures = {re.sub(r"(\.[^./]+)?$", ".png", name, count=1) for name in names}
     pictures |= {f"{name}.png" for name in names}
     found = [(file, file.relative_to(out / folder)) for folder in FOLDERS for file in (out / folder).rglob("*.png")]
-    delete_files(out, [out / EVALUATION_FILE, *(file for file, name in found if name.as_posix() in pictures)])
+    delete_files(out, [*reports, *(file for file, name in found if name.as_posix() in pictures)])
+
+
+def _unfinished(out: Path, made_of: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """What an interrupted evaluation of the same has measured, by photograph; not of sources that had been changed."""
+    report = read_json(out / UNFINISHED_FILE)
+    if (out / EVALUATION_FILE).exists() or not isinstance(report, dict) or str(made_of["commit"]).endswith("+"):
+        return {}
+    rows, keys = report.pop("per_photograph", None), {*NAMES, "reasons", "seen_share", "seconds"}
+    if report != json.loads(json.dumps(made_of)) or not isinstance(rows, dict):
+        return {}
+    return {name: row for name, row in rows.items() if isinstance(row, dict) and keys <= row.keys()}
 
 
 def _timed(render: Render, scene: Scene, index: int) -> tuple[Rendering, float]:
