@@ -235,7 +235,7 @@ def test_commits_are_those_of_training_and_of_evaluation(tmp_path: Path) -> None
     )
 
 
-def test_results_of_installed_packages_are_named_beside_those_of_sources(tmp_path: Path) -> None:
+def test_results_of_installed_packages_are_named_next_to_those_of_sources(tmp_path: Path) -> None:
     file = tmp_path / "a.json"
     for scene in ("fern", "lego"):
         keep_result(file, scene, "tidefield", 24.0)
