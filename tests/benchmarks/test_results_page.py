@@ -245,6 +245,11 @@ def test_results_of_installed_packages_are_named_next_to_those_of_sources(tmp_pa
     write_json(file, record)
     (commits,) = code_and_machines(read_figures([file], table.SCENES, names()))
     assert commits.endswith("1234567 (tidefield of fern); an installed package (tidefield of lego).")
+    former = record["results"][1]
+    del former["evaluation"]["commit"], former["process"]["train"]["commit"]  # earlier versions recorded none
+    write_json(file, record)
+    assert code_and_machines(read_figures([file], table.SCENES, names())) == ["Measured at commit 1234567."]
+    former["evaluation"]["commit"] = None
     record["results"][0]["evaluation"]["commit"] = record["results"][0]["process"]["train"]["commit"] = None
     write_json(file, record)
     assert code_and_machines(read_figures([file], table.SCENES, names())) == []

@@ -46,11 +46,12 @@ def test_a_file_that_refers_to_others_is_opened_only_if_its_name_says_so(tmp_pat
         open_surface(tmp_path / "b.tif")
 
 
-def test_a_service_is_not_asked_before_it_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize("name", ["a.tif", "a.vrt"])
+def test_a_service_is_not_asked_before_it_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str):
     monkeypatch.setattr("rasterio.open", lambda *_, **__: pytest.fail("it was opened"))
-    (tmp_path / "a.tif").write_text("\n<WCS_GDAL><ServiceURL>http://127.0.0.1:9/wcs?</ServiceURL></WCS_GDAL>")
-    with pytest.raises(ChangeError, match=r"a\.tif refers to other files or addresses"):
-        open_surface(tmp_path / "a.tif")
+    (tmp_path / name).write_text("\n<WCS_GDAL><ServiceURL>http://127.0.0.1:9/wcs?</ServiceURL></WCS_GDAL>")
+    with pytest.raises(ChangeError, match="refers to other files or addresses"):
+        open_surface(tmp_path / name)
 
 
 def test_a_surface_that_is_shifted_is_moved_to_the_east_and_north(tmp_path: Path):

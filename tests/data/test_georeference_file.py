@@ -40,6 +40,11 @@ def test_a_georeference_reads_back_as_written(tmp_path):
         np.testing.assert_array_equal(getattr(again, kind).error_m, getattr(FOUND, kind).error_m)
     np.testing.assert_array_equal(again.world_from_model.translation, [1, 2, 3])
     assert not again.gps_has_part
+    values = json.loads((tmp_path / FILE_NAME).read_text())
+    del values["gps_has_part"]  # as earlier versions wrote it
+    for source, has_part in (("ground control", False), ("GPS", True)):
+        (tmp_path / FILE_NAME).write_text(json.dumps(values | {"source": source}))
+        assert read_georeference(tmp_path).gps_has_part == has_part
 
 
 def test_statistics_use_only_known_and_accepted_residuals(tmp_path):

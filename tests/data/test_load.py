@@ -167,10 +167,13 @@ def test_the_layouts_own_split_is_kept(tmp_path: Path) -> None:
     assert len(scene.names) == 7
 
 
-@pytest.mark.parametrize("form", ["no folder", "no suffix", "elsewhere"])
+@pytest.mark.parametrize("form", ["no folder", "no suffix", "elsewhere", "rig"])
 def test_a_split_means_frames_by_shorter_and_longer_paths(form: str, tmp_path: Path) -> None:
     truth = survey(PINHOLE)
+    if form == "rig":  # cameras whose photographs have the same names
+        truth = replace(truth, names=tuple(f"cam{k % 3}/images/{k // 3}.png" for k in range(9)))
     files = {
+        "rig": [f"/home/me/rig/images/{name}" for name in truth.names],
         "no folder": list(truth.names),
         "no suffix": [f"images/{name}".removesuffix(".png") for name in truth.names],
         "elsewhere": [f"/home/me/images_2/{name}" for name in truth.names],

@@ -171,9 +171,10 @@ def test_an_evaluation_that_dies_leaves_no_older_report_beside_its_pictures(tmp_
     assert not list(tmp_path.glob("*evaluation*"))
 
 
-@pytest.mark.parametrize("changed", [False, True])
-def test_an_interrupted_evaluation_goes_on_unless_something_else_is_evaluated(tmp_path, monkeypatch, changed):
+@pytest.mark.parametrize(("changed", "asked"), [(False, True), (True, True), (False, False)])
+def test_an_interrupted_evaluation_goes_on_unless_something_else_is_evaluated(tmp_path, monkeypatch, changed, asked):
     monkeypatch.setattr(module, "commit", lambda: None)
+    anew = changed or not asked
     scene, rendered = wall.scene(wall.cameras(6), test=(1, 3, 4)), []
 
     def counted(camera: Cameras) -> Rendering:
@@ -183,15 +184,15 @@ def test_an_interrupted_evaluation_goes_on_unless_something_else_is_evaluated(tm
         return darker(camera)
 
     with pytest.raises(KeyboardInterrupt):
-        evaluate(counted, scene, tmp_path, configuration={"steps": 1}, console=quiet())
+        evaluate(counted, scene, tmp_path, configuration={"steps": 1}, console=quiet(), goes_on=True)
     (tmp_path / "renderings" / "01.png").unlink()
     steps = {"steps": 2 if changed else 1}
-    found = evaluate(counted, scene, tmp_path, configuration=steps, console=quiet())
-    assert rendered[3:] == (["01.jpg", "03.jpg", "04.jpg"] if changed else ["01.jpg", "04.jpg"])
+    found = evaluate(counted, scene, tmp_path, configuration=steps, console=quiet(), goes_on=asked)
+    assert rendered[3:] == (["01.jpg", "03.jpg", "04.jpg"] if anew else ["01.jpg", "04.jpg"])
     whole = evaluate(darker, scene, tmp_path / "whole", configuration=steps, console=quiet())
     assert found.mean == whole.mean
     assert list(found.report["per_photograph"]) == ["01.jpg", "03.jpg", "04.jpg"]
-    assert found.report.get("of_an_interrupted_evaluation") == (None if changed else 2)
+    assert found.report.get("of_an_interrupted_evaluation") == (None if anew else 2)
     assert not (tmp_path / "measured_so_far.json").exists()
     evaluate(counted, scene, tmp_path, configuration=steps, console=quiet(), overwrite=True)
     assert rendered[-3:] == ["01.jpg", "03.jpg", "04.jpg"]

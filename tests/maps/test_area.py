@@ -85,8 +85,16 @@ def test_areas_are_read_from_other_formats_in_their_own_system(tmp_path: Path, n
 
 def test_a_system_that_nobody_knows_is_refused(tmp_path: Path):
     system = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::999999"}}
-    with pytest.raises(RunError, match=r"is no GeoJSON.*999999"):
+    with pytest.raises(RunError, match=r"names the coordinate system .*999999.*, which nobody knows"):
         read_shapes(write(tmp_path / "a.geojson", polygon(SQUARE), crs=system), FRAME, "Polygon")
+
+
+@pytest.mark.parametrize(
+    "name", ["CRS84", "CRS:84", "urn:ogc:def:crs:OGC:1.3:CRS84", "http://www.opengis.net/gml/srs/epsg.xml#4326"]
+)
+def test_names_of_longitude_and_latitude_are_read(tmp_path: Path, name: str):
+    path = write(tmp_path / "a.geojson", polygon(SQUARE), crs={"type": "name", "properties": {"name": name}})
+    assert area(path) == pytest.approx(SIDE**2, rel=1e-5)
 
 
 def test_a_degenerate_polygon_next_to_a_line_is_no_line(tmp_path: Path):

@@ -86,7 +86,10 @@ def _sampled(
     )
     values, known = np.zeros((len(rows), len(columns))), np.zeros((len(rows), len(columns)), bool)
     count = dict.fromkeys(sentinels, 0)
+    block = dataset.block_shapes[0][0]
     step = max(1, _STRIP_CELLS // dataset.width)
+    if block * dataset.width <= 8 * _STRIP_CELLS:  # else a block would be decoded for several strips
+        step = -(-step // block) * block
     for first in range(0, dataset.height, step):
         raw = dataset.read(1, window=((first, min(first + step, dataset.height)), (0, dataset.width)), masked=True)
         strip = raw.filled(0).astype(np.float64)

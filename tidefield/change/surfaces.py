@@ -296,7 +296,8 @@ def opened(path: Path) -> Iterator[Any]:
     rasterio = need("rasterio")
     with reading_from(path), path.open("rb") as file:
         start = file.read(64).lstrip(b"\xef\xbb\xbf \t\r\n")
-    if start[:1] in (b"<", b"{") and not start.startswith(b"<VRTDataset") and path.suffix[1:].upper() not in _REFERRING:
+    of_services = {*_REFERRING} - {"VRT"}
+    if start[:1] in (b"<", b"{") and b"<VRTDataset" not in start and path.suffix[1:].upper() not in of_services:
         raise _refers(path, "text")  # GDAL asks the address as it opens such a file
     try:
         with rasterio.Env(GDAL_CACHEMAX=128), rasterio.open(path) as dataset:

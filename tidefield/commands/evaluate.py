@@ -70,6 +70,7 @@ def evaluate(options: Evaluate, console: Console) -> Evaluation:
     source, out, method, zero_shot = options.source, options.out, options.method, options.zero.checked().zero_shot
     sampling = options.footprint.sampling
     settings = {"overwrite": options.overwrite, "console": console, "download_lpips": options.download_lpips}
+    settings["goes_on"] = not options.overwrite
     if method is not None and zero_shot:
         raise RunError("both --method and --zero-shot are given: expected one of them; leave one out")
     if options.opened_width is not None and not zero_shot:

@@ -95,7 +95,7 @@ def summarise(results: Results) -> list[str]:
     }
     found = [f"{sentence}: {', '.join(groups[effect])}." for effect, sentence in sentences.items() if effect in groups]
     if noise is None:
-        once = "All were trained with one seed: how far trainings are apart is not known, and a difference may be that."
+        once = "All were trained with one seed: how far trainings are apart was not measured; a difference may be that."
         return [*found, once] if found else []
     return [
         *found,

@@ -25,7 +25,7 @@ def records_of(results: Results) -> list[tuple[str, Record]]:
 
 def code_and_machines(results: Results) -> list[str]:
     """Which commit and which machine measured what: code, and what a minute brings, are not the same on all of them."""
-    commits = _groups({k: _commit_of(one) for k, one in results.by.items()})
+    commits = _groups({k: commit for k, one in results.by.items() if (commit := _commit_of(one))})
     machines = _groups({k: machine for k, one in results.by.items() if (machine := _machine_of(one))})
 
     def each(groups: Mapping[str, str]) -> str:
@@ -46,10 +46,13 @@ def short(commit: object) -> str:
     return str(commit)[:7] + "+" * str(commit).endswith("+")
 
 
-def _commit_of(result: Result) -> str:
-    """The code that a result was measured with: only sources have a commit."""
-    found = {"train": result.process.get("train", {}).get("commit"), "evaluate": result.evaluation.get("commit")}
-    return _of_steps({step: short(commit) for step, commit in found.items() if commit}) or _INSTALLED
+def _commit_of(result: Result) -> str | None:
+    """The code that a result was measured with; None where nothing was recorded, as by earlier versions."""
+    records = {"train": result.process.get("train", {}), "evaluate": result.evaluation}
+    found = {step: record["commit"] for step, record in records.items() if "commit" in record}
+    return _of_steps({step: short(commit) for step, commit in found.items() if commit}) or (
+        _INSTALLED if found else None
+    )
 
 
 def _machine_of(result: Result) -> str | None:

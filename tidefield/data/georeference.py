@@ -231,7 +231,7 @@ def _from_json(values: dict[str, Any], path: Path) -> Georeference:
         control_world=np.array(
             [numbers({"point": point}, "point", path, (3,)) for point in values.get("control_world", [])]
         ).reshape(-1, 3),
-        gps_has_part=bool(values.get("gps_has_part", True)),
+        gps_has_part=bool(values.get("gps_has_part", values["source"] != "ground control")),
         **residuals,
     )
 

@@ -25,6 +25,7 @@ from rich.table import Table
 from tidefield import __version__
 from tidefield.config import PROTOCOL
 from tidefield.data.holdout import FILE_NAME as HOLDOUT_FILE
+from tidefield.data.images import photographs_key
 from tidefield.data.scene import Scene, poses_key
 from tidefield.data.surface import doubly_seen
 from tidefield.errors import RunError
@@ -64,11 +65,12 @@ def evaluate(
     overwrite: bool = False,
     console: Console | None = None,
     download_lpips: bool = False,
+    goes_on: bool = False,
 ) -> Evaluation:
     """Render every held-out photograph's camera, measure the metrics, and print a table.
 
     Writes `out/renderings/NAME.png`, `out/pictures/NAME.png` (ground truth | rendering | error | depth) and, last and
-    complete, `out/evaluation.json`. What an interrupted evaluation of the same method and scene has done is kept.
+    complete, `out/evaluation.json`.
 
     Args:
         render: the method.
@@ -78,6 +80,8 @@ def evaluate(
         overwrite: replace an existing evaluation.
         console: where to print; standard output if None.
         download_lpips: download the weights that LPIPS needs if they are missing.
+        goes_on: keep what an interrupted evaluation of the same configuration and photographs has measured; only where
+            the configuration identifies the method, with its weights.
 
     Raises:
         RunError: `out` holds an evaluation or cannot be written to, the scene holds no photograph out, or a rendering
@@ -110,7 +114,8 @@ def evaluate(
         "lpips_weights": {metric: n.sha256 for metric, n in networks.items() if isinstance(n, Lpips)},
         "configuration": dict(configuration),
     }
-    photographs = _unfinished(out, made_of)
+    files_key = photographs_key(scene.photographs.files, scene.photographs.background_rgb)
+    photographs = _unfinished(out, {**made_of, "photographs": files_key}) if goes_on else {}
     continued = len(photographs)
     with ProgressBar(console, "Evaluating") as bar:
         for index, file in zip(scene.test, files, strict=True):
@@ -130,7 +135,8 @@ def evaluate(
                 "seconds": seconds,
             }
             _write_pictures(out, file, image, truth, rendering)
-            write_json(out / UNFINISHED_FILE, {**made_of, "per_photograph": photographs})
+            unfinished = {**made_of, "photographs": files_key, "per_photograph": photographs}
+            write_json(out / UNFINISHED_FILE, unfinished)
             bar(len(photographs), len(scene.test))
     photographs = {scene.names[i]: photographs[scene.names[i]] for i in scene.test}
     seconds_in_all = sum(row["seconds"] for row in photographs.values())

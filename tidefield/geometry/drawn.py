@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import re
 from collections.abc import Iterator
@@ -27,8 +28,6 @@ _EXPECTED = "expected polygons or lines as GeoJSON, GeoPackage or shapefile; nam
 _NAMES = ("name", "id", "label", "title", "location", "tr_id")
 _REFERENCES = (b"<OGR", b"gdal_streamed_alg")
 """Of GDAL's files that refer to other files, or addresses."""
-_SYSTEM = re.compile(rb'"crs"\s*:\s*\{[^}]*"name"\s*:\s*"([^"]+)"')
-"""The name in the member `crs` of a GeoJSON file."""
 
 
 @dataclass(frozen=True)
@@ -123,13 +122,12 @@ def read_drawn(path: Path) -> Drawn:
     if any(words in start for words in _REFERENCES) or start.startswith(b"PK"):  # an archive may hold such a file
         raise RunError(f"{path} refers to other data: {_EXPECTED}")
     try:
-        if named := _SYSTEM.search(whole):  # GDAL takes longitude and latitude instead of one that it does not know
-            CRS.from_user_input(named[1].decode())
         layer = _layer(path, [str(name) for name, kind in list_layers(path) if kind is not None], asked)
         meta, _, shapes, columns = raw.read(path, layer=layer, max_features=_MOST + 1, force_2d=True)
         with np.errstate(invalid="ignore"):  # `Drawn.placed` refuses what is not finite
             geometries = shapely.from_wkb(shapes)
         crs = CRS(meta["crs"]) if meta["crs"] else None
+        _require_system(path, whole, crs)
     except (DataSourceError, DataLayerError, ValueError, ProjError, shapely.errors.ShapelyError) as error:
         raise RunError(f"{path} is no GeoJSON, GeoPackage or shapefile ({error}): {_EXPECTED}") from error
     if len(geometries) > _MOST:
@@ -146,6 +144,22 @@ def read_drawn(path: Path) -> Drawn:
         # GeoPackages call a system without a place on Earth undefined.
         None if crs is None or is_local(crs) else crs,
     )
+
+
+def _require_system(path: Path, text: bytes, crs: CRS | None) -> None:
+    """Refuse GeoJSON in a system that nobody knows: GDAL takes longitude and latitude instead."""
+    if not text or crs is None or crs.to_epsg() != 4326:
+        return
+    member = json.loads(text).get("crs")
+    name = member.get("properties", {}).get("name") if isinstance(member, dict) else None
+    if isinstance(name, str) and not re.search(r"84$|4326$", name):
+        try:
+            CRS.from_user_input(name)
+        except ProjError as error:
+            raise RunError(
+                f"{path} names the coordinate system {name!r}, which nobody knows ({error}): expected one of EPSG's; "
+                "correct the member crs"
+            ) from error
 
 
 def _parts(shape: BaseGeometry) -> Iterator[BaseGeometry]:

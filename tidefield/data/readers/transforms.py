@@ -218,13 +218,20 @@ def read_split(top: Mapping[str, Any], file: Path) -> tuple[frozenset[str], froz
 
 
 def find_listed(listed: Iterable[str], names: Iterable[str]) -> dict[str, str | None]:
-    """Find which of these names each listed path means: the same path, or the same below a folder of images in one size
-    or another; without suffixes where these differ. None if it means none of them."""
-    by_form: dict[str, str] = {}
-    for name in names:
-        for form in _forms(name):
-            by_form.setdefault(form, name)
-    return {path: next((by_form[form] for form in _forms(path) if form in by_form), None) for path in listed}
+    """Find which of these names each listed path means: the same path, the same below a folder of images in one size or
+    another, or the end of a path of another machine; without suffixes where these differ. None if it means none of
+    them, or may mean several."""
+    by_form: dict[str, str | None] = {}
+    for name in (own := set(names)):
+        for form in set(_forms(name)) - (own - {name}):
+            by_form[form] = None if form in by_form else name
+    found = {}
+    for path in listed:
+        parts = path.split("/")
+        ends = ["/".join(parts[k:]) for k in range(1, len(parts))] if posixpath.isabs(path) else []
+        forms = [form for end in (path, *ends) for form in _forms(end)]
+        found[path] = next((by_form[form] for form in forms if form in by_form), None)
+    return found
 
 
 def _forms(path: str) -> list[str]:
