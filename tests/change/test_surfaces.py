@@ -119,7 +119,7 @@ def test_overviews_do_not_hide_what_is_no_height(tmp_path: Path, monkeypatch: py
 
 def test_small_holes_are_found_wherever_they_lie(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("tidefield.change.nodata._SAMPLE", 10)
-    monkeypatch.setattr("tidefield.change.nodata._STRIP_CELLS", 1000)
+    monkeypatch.setattr("tidefield.change.nodata.STRIP_CELLS", 1000)
     values = plane(100, 100, 0.5) + np.float32(50)
     values[6:9, 41:44] = -9999
     path = write_surface(tmp_path / "a.tif", values)

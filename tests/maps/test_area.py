@@ -97,6 +97,12 @@ def test_names_of_longitude_and_latitude_are_read(tmp_path: Path, name: str):
     assert area(path) == pytest.approx(SIDE**2, rel=1e-5)
 
 
+def test_a_feature_a_line_is_read(tmp_path: Path):
+    features = [{"type": "Feature", "geometry": polygon(SQUARE), "properties": {"k": k}} for k in range(2)]
+    (tmp_path / "a.geojsonl").write_text("\n".join(map(json.dumps, features)))
+    assert len(read_shapes(tmp_path / "a.geojsonl", FRAME, "Polygon")) == 2
+
+
 def test_a_degenerate_polygon_next_to_a_line_is_no_line(tmp_path: Path):
     line, spike = {"type": "LineString", "coordinates": SQUARE}, polygon(ring((0, 0), (1, 1), (2, 2)))
     assert len(read_shapes(write(tmp_path / "a.geojson", line, spike), FRAME, "LineString")) == 1

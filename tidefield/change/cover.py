@@ -24,9 +24,10 @@ from scipy.ndimage import label
 
 from tidefield.change.errors import nmad
 from tidefield.change.light import greenness, light_gains, with_light
+from tidefield.change.nodata import STRIP_CELLS
 from tidefield.change.regions import Region
 from tidefield.change.shift import picture_grid, read_picture
-from tidefield.change.surfaces import STRIP_CELLS, ChangeError, Grid
+from tidefield.change.surfaces import ChangeError, Grid
 from tidefield.maps.smoothing import smoothed
 
 MARGIN = 0.065
@@ -190,8 +191,8 @@ def compare_cover(
     # Each date has its own white balance at first, so its own bare ground.
     bare_ground = known & (first < _bare(first[known]) + _BARE_MARGIN) & (second < _bare(second[known]) + _BARE_MARGIN)
     gains = light_gains(earlier, later, _enough(bare_ground, known))
-    evened = with_light(later, gains)
-    second = greenness(smoothed(evened, known, sigma))
+    corrected = with_light(later, gains)
+    second = greenness(smoothed(corrected, known, sigma))
     bare = _bare(np.concatenate([first[known], second[known]]))
     bare_ground = known & (first < bare + _BARE_MARGIN) & (second < bare + _BARE_MARGIN)
     difference = (second - first)[_enough(bare_ground, known)]
@@ -206,7 +207,7 @@ def compare_cover(
     scatter /= math.sqrt(2)
     cell, areas, least = grid.cell_area_m2, {}, math.sqrt(2) * scatter
     clearly, classes = np.abs(second - first) > least, {}
-    first, second = (greenness(smoothed(picture, known, fine)) for picture in (earlier, evened))
+    first, second = (greenness(smoothed(picture, known, fine)) for picture in (earlier, corrected))
     for k in (-1, 0, 1):
         threshold = bare + MARGIN * _SPAN**k + k * scatter
         before, after = (

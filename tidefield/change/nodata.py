@@ -14,7 +14,8 @@ from scipy.ndimage import binary_dilation, label
 
 _SAMPLE = 1000
 """Rows and columns of a large surface that are compared with each other to see what its values are."""
-_STRIP_CELLS = 1 << 22
+STRIP_CELLS = 1 << 22
+"""Cells read at once."""
 _SENTINELS = (-10000.0, -9999.0, -99999.0, -32768.0, -32767.0, 9999.0, 1e20)
 """Values that programs write where they know no height; some do not declare them."""
 IMPOSSIBLE_M = 20_000.0
@@ -87,8 +88,8 @@ def _sampled(
     values, known = np.zeros((len(rows), len(columns))), np.zeros((len(rows), len(columns)), bool)
     count = dict.fromkeys(sentinels, 0)
     block = dataset.block_shapes[0][0]
-    step = max(1, _STRIP_CELLS // dataset.width)
-    if block * dataset.width <= 8 * _STRIP_CELLS:  # else a block would be decoded for several strips
+    step = max(1, STRIP_CELLS // dataset.width)
+    if block * dataset.width <= 8 * STRIP_CELLS:  # else a block would be decoded for several strips
         step = -(-step // block) * block
     for first in range(0, dataset.height, step):
         raw = dataset.read(1, window=((first, min(first + step, dataset.height)), (0, dataset.width)), masked=True)

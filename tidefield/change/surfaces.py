@@ -15,7 +15,7 @@ from jaxtyping import Float32, Float64
 from pyproj import CRS, Transformer
 from pyproj.exceptions import CRSError, ProjError
 
-from tidefield.change.nodata import IMPOSSIBLE_M, cleared, is_masked, undeclared
+from tidefield.change.nodata import IMPOSSIBLE_M, STRIP_CELLS, cleared, is_masked, undeclared
 from tidefield.errors import TidefieldError, need
 from tidefield.files import reading_from
 from tidefield.geometry.geodesy import (
@@ -33,8 +33,6 @@ from tidefield.geometry.geodesy import (
 if TYPE_CHECKING:
     from affine import Affine
 
-STRIP_CELLS = 1 << 22
-"""Cells read at once."""
 MOST_CELLS = 400_000_000
 """Of a common grid: what fits into 16 GB."""
 PLAIN = 'LOCAL_CS["metres",UNIT["metre",1]]'

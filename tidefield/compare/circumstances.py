@@ -50,9 +50,8 @@ def _commit_of(result: Result) -> str | None:
     """The code that a result was measured with; None where nothing was recorded, as by earlier versions."""
     records = {"train": result.process.get("train", {}), "evaluate": result.evaluation}
     found = {step: record["commit"] for step, record in records.items() if "commit" in record}
-    return _of_steps({step: short(commit) for step, commit in found.items() if commit}) or (
-        _INSTALLED if found else None
-    )
+    commits = {step: short(commit) for step, commit in found.items() if commit}
+    return _INSTALLED if found and not commits else _of_steps(commits)
 
 
 def _machine_of(result: Result) -> str | None:

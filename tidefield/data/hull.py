@@ -87,6 +87,7 @@ def is_background(
     row[used] = np.arange(len(used))
     in_frame, clear = np.zeros((2, len(used), len(train)), bool)
     shown, chance = np.zeros(len(used), bool), []
+    observed = points.by_photograph(len(T_world_camera))
     for k, i in enumerate(train):
         alpha = photographs.alpha(i)
         if alpha is None:
@@ -95,15 +96,14 @@ def is_background(
         xyz = (points.xyz_world[used] - centre) @ R
         front = xyz[:, 2] > 0
         uv = np.full((len(used), 2), -1.0)
-        lens = pinholes[i]
-        uv[front] = xyz[front, :2] / xyz[front, 2:] * (lens.fx, lens.fy) + (lens.cx, lens.cy)
+        uv[front] = pinholes[i].project(xyz[front])
         height, width = alpha.shape
         in_frame[:, k] = front & (uv >= 0).all(axis=1) & (uv < (width, height)).all(axis=1)
         u, v = uv[in_frame[:, k]].astype(np.int64).T
         is_clear = (alpha < _CLEAR).numpy()
         clear[in_frame[:, k], k] = is_clear[v, u]
         chance.append(float(is_clear.mean()))
-        seen = row[points.point_index[points.photograph_index == i]]
+        seen = row[points.point_index[observed[i]]]
         seen = seen[seen >= 0]
         shown[seen] |= in_frame[seen, k] & ~clear[seen, k]
     # Points that are observed on transparent pixels alone may be of what was cut off.

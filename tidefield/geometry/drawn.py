@@ -148,10 +148,11 @@ def read_drawn(path: Path) -> Drawn:
 
 def _require_system(path: Path, text: bytes, crs: CRS | None) -> None:
     """Refuse GeoJSON in a system that nobody knows: GDAL takes longitude and latitude instead."""
-    if not text or crs is None or crs.to_epsg() != 4326:
+    if b'"crs"' not in text or crs is None or crs.to_epsg() != 4326:
         return
-    member = json.loads(text).get("crs")
-    name = member.get("properties", {}).get("name") if isinstance(member, dict) else None
+    name: Any = json.loads(text)
+    for key in ("crs", "properties", "name"):
+        name = name.get(key) if isinstance(name, dict) else None
     if isinstance(name, str) and not re.search(r"84$|4326$", name):
         try:
             CRS.from_user_input(name)

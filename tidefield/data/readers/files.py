@@ -111,21 +111,17 @@ def open_picture(path: Path) -> Iterator[Image.Image]:
         _size(path, _PICTURE_MEGABYTES)
         with Image.open(path) as picture:
             yield picture
-    except UnidentifiedImageError as error:
-        with path.open("rb") as file:
-            is_tiff = file.read(4) in (b"II*\0", b"MM\0*")
-        what = "expected 8 bits per colour, in grey or in red, green and blue; convert it"
-        if not is_tiff:
-            what = (
-                "expected a complete JPEG or PNG; copy it again from the camera, or remove it and use --allow-missing"
-            )
-        raise SceneError(f"{path} cannot be read as a photograph ({error}): {what}") from error
     # Pillow raises SyntaxError for broken PNGs, and a plain Exception for decompression bombs.
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise SceneError(
-            f"{path} cannot be read as a photograph ({error}): expected a complete JPEG or PNG; copy it again from the "
-            "camera, or remove it and use --allow-missing"
-        ) from error
+        expected = "a complete JPEG or PNG; copy it again from the camera, or remove it and use --allow-missing"
+        if isinstance(error, UnidentifiedImageError) and _is_tiff(path):
+            expected = "8 bits per colour, in grey or in red, green and blue; convert it"
+        raise SceneError(f"{path} cannot be read as a photograph ({error}): expected {expected}") from error
+
+
+def _is_tiff(path: Path) -> bool:
+    with path.open("rb") as file:
+        return file.read(4) in (b"II*\0", b"MM\0*")
 
 
 @contextmanager

@@ -223,8 +223,9 @@ def find_listed(listed: Iterable[str], names: Iterable[str]) -> dict[str, str | 
     them, or may mean several."""
     by_form: dict[str, str | None] = {}
     for name in (own := set(names)):
-        for form in set(_forms(name)) - (own - {name}):
-            by_form[form] = None if form in by_form else name
+        for form in set(_forms(name)):
+            if form == name or form not in own:
+                by_form[form] = None if form in by_form else name
     found = {}
     for path in listed:
         parts = path.split("/")
