@@ -90,6 +90,19 @@ def test_every_method_is_trained_and_evaluated_once(disk: Path, tmp_path: Path):
     assert record["evaluate"]["command"] == "tidefield evaluate RUN --device cpu"
 
 
+def test_a_comparison_goes_on_where_it_and_its_scenes_were_moved_to(disk: Path, tmp_path: Path):
+    run, contents = Children(load_scene(disk, width=48)), {"flats": "those of its files"}
+    compare({"flats": disk}, ("nearest",), SETTINGS, tmp_path / "out", run, quiet, contents)
+    compare({"flats": disk}, ("nearest",), SETTINGS, tmp_path / "without", run, quiet)
+    for folder in ("flats", "out", "without"):
+        (tmp_path / folder).rename(tmp_path / f"moved-{folder}")
+    done, moved = len(run.words), {"flats": tmp_path / "moved-flats"}
+    compare(moved, ("nearest",), SETTINGS, tmp_path / "moved-out", run, quiet, contents)
+    assert len(run.words) == done
+    with pytest.raises(RunError, match=r"was made with .*'scene'"):  # nothing says that it is the same
+        compare(moved, ("nearest",), SETTINGS, tmp_path / "moved-without", run, quiet)
+
+
 def test_zero_shot_uses_the_weights_of_its_preset() -> None:
     for method, preset in (("zero-shot", "swift"), ("paper-zero-shot", "paper")):
         asked = commands(Path("data"), Path("run"), method, SETTINGS)
@@ -496,7 +509,7 @@ def test_the_limits_of_nerfacto_are_stated_where_it_ran_on_a_cpu(disk: Path, tmp
     on_a_gpu = Children(load_scene(disk, width=48))
     compare({"flats": disk}, ("nerfacto",), replace(SETTINGS, device="cuda:0"), tmp_path / "gpu", on_a_gpu, quiet)
     (sentence,) = nerfacto_limits(read_results(tmp_path / "gpu", ["flats"], ["nerfacto"]))
-    assert sentence == "Within the budget Nerfacto made 7 steps, 0.0% of its default of 30,000."
+    assert sentence.startswith("Within the budget Nerfacto made 7 steps, 0.0% of its default of 30,000. Its memory is")
 
 
 def test_the_limits_of_opensplat_are_stated(disk: Path, tmp_path: Path):

@@ -352,6 +352,13 @@ def test_a_map_that_was_made_again_is_shown_when_the_page_is_loaded_again(tmp_pa
         assert again["version"] != first["version"]
         assert again["bounds"][2] > first["bounds"][2]
         assert asked("atlas.json") == again
+        tile = "tile/0/height/0/0/0.png?version="
+        urllib.request.urlopen(f"{page.address}/{tile}{again['version']}").close()
+        x, y = corner(5, 5)
+        for question in (tile, f"at?points={x},{y}&version="):
+            with pytest.raises(urllib.error.HTTPError) as refusal:
+                asked(question + first["version"])
+            assert "reload this page" in json.load(refusal.value)["error"]
         (folder / "odm_dem" / "dsm.tif").write_bytes(b"II*\0 half of it")
         with pytest.raises(urllib.error.HTTPError) as refusal:
             asked("atlas.json")

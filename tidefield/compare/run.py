@@ -343,9 +343,12 @@ def require_same_settings(scenes: Mapping[str, Path], methods: Sequence[str], se
     """Raises: RunError when the folder of a comparison holds damaged results, or such of other settings."""
     for folder, _, scene, method in _jobs(scenes, methods, out):
         read_evaluation(folder)
-        wanted, found = _record(scene, method, settings), read_process(folder).get("settings")
-        if found not in (None, wanted):
-            was = {key: found.get(key) for key in wanted if found.get(key) != wanted[key]}
+        wanted, process = _record(scene, method, settings), read_process(folder)
+        found = process.get("settings", wanted)
+        if "contents" in process.get("scene", {}):
+            wanted |= {"scene": found.get("scene")}  # it may have been moved: `require_same_sources` compares what it is
+        was = {key: found.get(key) for key in wanted if found.get(key) != wanted[key]}
+        if was:
             asked = {key: wanted[key] for key in was}
             raise RunError(f"{folder} was made with {was}: expected {asked}; name another folder with --out")
 

@@ -54,6 +54,7 @@ NERFACTO_STEPS, NERFACTO_RAYS, NERFACTO_CPU_RAYS = 30_000, 4096, 1024
 (`baselines/nerfstudio/worker.py`)."""
 OPENSPLAT_STEPS, OPENSPLAT_SCHEDULE = 30_000, 3_000
 """OpenSplat's default number of steps, and after how many it doubles the photographs' size, from a quarter on."""
+_LARGER = "Its memory is that of the larger of two processes, its own and Tidefield's."
 _THOUSANDS = re.compile(r"(?<=\d),(?=\d{3})")
 _ESCAPES = str.maketrans(
     {c: rf"\{c}" for c in "&%_#${}"}
@@ -245,11 +246,11 @@ def nerfacto_limits(results: Results) -> list[str]:
     if not steps:
         return []
     if devices != {"cpu"}:
-        return [f"Within the budget Nerfacto made {_share_of_default(steps, NERFACTO_STEPS)}."]
+        return [f"Within the budget Nerfacto made {_share_of_default(steps, NERFACTO_STEPS)}. {_LARGER}"]
     return [
         f"Nerfacto ran on CPUs, with {NERFACTO_CPU_RAYS:,} rays a batch instead of its default of {NERFACTO_RAYS:,}; "
         f"within the budget it made {_share_of_default(steps, NERFACTO_STEPS)}. Its figures are those of a method at "
-        "the start of its training, and they are no evidence about Nerfacto trained to its end on a GPU."
+        "the start of its training, and they are no evidence about Nerfacto trained to its end on a GPU. {_LARGER}"
     ]
 
 
@@ -261,7 +262,7 @@ def opensplat_limits(results: Results) -> list[str]:
     return [
         f"Within the budget OpenSplat made {_share_of_default(steps, OPENSPLAT_STEPS)}; by default, it makes the first "
         f"{OPENSPLAT_SCHEDULE:,} with photographs of a quarter of their size, and as many more with half of it. It "
-        "reads no masks. Its views are rendered by Tidefield, whose speed is not that of OpenSplat."
+        "reads no masks. Its views are rendered by Tidefield, whose speed is not that of OpenSplat. {_LARGER}"
     ]
 
 

@@ -82,6 +82,11 @@ class _Server(ThreadingHTTPServer):
                 self._show(Atlas(self.atlas.folders))
             return self.atlas, self.version
 
+    def require_current(self, query: dict[str, list[str]]) -> None:
+        """Raises: RunError when the files have changed since a page was loaded: its colours and corners are others."""
+        if "version" in query and (query["version"] != [self.version] or self.atlas.is_outdated):
+            raise RunError("the maps were made again: reload this page")
+
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Log what has ended a connection; Python would print it on the terminal, whatever was asked for."""
         error = sys.exception()
@@ -124,14 +129,10 @@ class _Handler(BaseHTTPRequestHandler):
         elif path == "/atlas.json":
             atlas, version = self._own.renewed()
             self._json({**atlas.describe(), "version": version})
-        elif path == "/at":
-            (point,) = _points(query, 1, 1)
-            self._json(atlas.at(*point.tolist()))
-        elif path == "/section":
-            self._json(atlas.section(_points(query, 2, MOST_POINTS)))
-        elif path == "/area":
-            detection = _number(query.get("detection", ["0"])[0])
-            self._json(atlas.area(_points(query, 3, MOST_POINTS), max(0.0, detection)))
+        elif path in ("/at", "/section", "/area"):
+            measured = _measure(atlas, path, query)
+            self._own.require_current(query)
+            self._json(measured)
         elif found := _TILE.fullmatch(path):
             sheet, layer, level, column, row = found.groups()
             try:
@@ -141,6 +142,7 @@ class _Handler(BaseHTTPRequestHandler):
                     self._own.unreadable.add((sheet, layer))
                     log.warning(str(error))
                 raise
+            self._own.require_current(query)
             if content is None:
                 self._send(HTTPStatus.NO_CONTENT, "image/png", b"")
             else:
@@ -164,6 +166,17 @@ class _Handler(BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *values: Any) -> None:
         log.debug(format, *values)
+
+
+def _measure(atlas: Atlas, path: str, query: dict[str, list[str]]) -> Any:
+    """The answer to a question about places."""
+    if path == "/at":
+        (point,) = _points(query, 1, 1)
+        return atlas.at(*point.tolist())
+    if path == "/section":
+        return atlas.section(_points(query, 2, MOST_POINTS))
+    detection = _number(query.get("detection", ["0"])[0])
+    return atlas.area(_points(query, 3, MOST_POINTS), max(0.0, detection))
 
 
 def _split(address: str) -> SplitResult:
