@@ -346,7 +346,7 @@ def require_same_settings(scenes: Mapping[str, Path], methods: Sequence[str], se
         wanted, process = _record(scene, method, settings), read_process(folder)
         found = process.get("settings", wanted)
         if "contents" in process.get("scene", {}):
-            wanted |= {"scene": found.get("scene")}  # it may have been moved: `require_same_sources` compares what it is
+            wanted |= {"scene": found.get("scene")}  # moved, perhaps; `require_same_sources` knows
         was = {key: found.get(key) for key in wanted if found.get(key) != wanted[key]}
         if was:
             asked = {key: wanted[key] for key in was}
