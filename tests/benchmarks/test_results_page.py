@@ -114,7 +114,8 @@ def test_the_page_shows_what_was_stored_and_what_is_missing(tmp_path: Path) -> N
         "A frame of 4000 x 3000 px from 12 photographs of that size, decoding and encoding included (swift, cpu): "
         "6.50 GB, 70 s.",
         "Photographs of 640 px. On one card.",
-        "Within the budget Nerfacto made 1,234 steps, 4.1% of its default of 30,000.",
+        "Within the budget Nerfacto made 1,234 steps, 4.1% of its default of 30,000. "
+        "Its memory is that of the larger of two processes, its own and Tidefield's.",
         "| caliterra ² | **36.00** | 33.00 |",
         "### On a GPU: Zero-shot views of 1920 x 1080 px, swift, cuda:0",
         "    large frames",
