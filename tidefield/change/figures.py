@@ -19,10 +19,10 @@ from tidefield.change.measure import Change
 from tidefield.change.surfaces import Grid
 from tidefield.change.water import Waterline
 from tidefield.maps.figures import INCHES, INK, RULE, SOFT, Extent, figure_of, map_of, png
+from tidefield.maps.styles import HIGHER, LOWER, PLANTS
 from tidefield.maps.terrain import hillshade
 
-LOWER, HIGHER, STABLE = "#b2182b", "#2166ac", "#7a9a3a"
-GAINED, LOST = "#1a7a3c", "#b8742a"
+STABLE = "#7a9a3a"
 _SIDE = 1400
 """Longest side of a map, cells."""
 
@@ -100,7 +100,7 @@ def draw_cover(cover: Cover, small: Thinned, what: str) -> Markup:
     classes, extent = cover.classes[::step, ::step], _extent(cover.grid.thinned(step))
     figure, axes = _map(small)
     handles = []
-    for code, colour, label in ((2, "#b9c8a0", "plants at both dates"), (1, GAINED, "gained"), (-1, LOST, "lost")):
+    for code, colour, label in PLANTS:
         shown = np.where(classes == code, 1.0, np.nan)
         axes.imshow(shown, cmap=ListedColormap([colour]), extent=extent, interpolation="nearest")
         handles.append(Patch(color=colour, label=label))

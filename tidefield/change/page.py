@@ -11,8 +11,6 @@ import numpy as np
 from tidefield.change.cover import Area, Cover
 from tidefield.change.errors import colour_limit
 from tidefield.change.figures import (
-    HIGHER,
-    LOWER,
     draw_change,
     draw_cover,
     draw_section,
@@ -29,6 +27,7 @@ from tidefield.change.volumes import Volume
 from tidefield.change.water import Water
 from tidefield.change.write import outline_rows
 from tidefield.files import write_text
+from tidefield.maps.styles import HIGHER, LOWER
 from tidefield.pages import template_environment
 
 MINUS = "\u2212"

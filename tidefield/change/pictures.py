@@ -13,12 +13,12 @@ from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from tidefield import SOFTWARE
-from tidefield.change.figures import GAINED as GREEN
-from tidefield.change.figures import HIGHER as BLUE
-from tidefield.change.figures import LOST as BROWN
-from tidefield.change.figures import LOWER as RED
 from tidefield.change.kinds import COLOUR, GAINED, HIGHER, LIGHT, LOST, LOWER, UNKNOWN, View
 from tidefield.files import completed_file, write_text
+from tidefield.maps.styles import GAINED as GREEN
+from tidefield.maps.styles import HIGHER as BLUE
+from tidefield.maps.styles import LOST as BROWN
+from tidefield.maps.styles import LOWER as RED
 from tidefield.pages import template_environment
 
 KINDS = {

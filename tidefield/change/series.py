@@ -16,13 +16,13 @@ from typing import Any, Literal
 import numpy as np
 from markupsafe import Markup
 
-from tidefield.change.figures import HIGHER, LOWER
 from tidefield.change.measure import Change
 from tidefield.change.page import cubic
 from tidefield.change.volumes import Volume
 from tidefield.change.write import write_csv
 from tidefield.files import write_json, write_text
 from tidefield.maps.figures import INK, RULE, SOFT, figure_of, png
+from tidefield.maps.styles import HIGHER, LOWER
 from tidefield.pages import template_environment
 
 _MOST_PLOTS = 12

@@ -18,7 +18,7 @@ from shapely.geometry.base import BaseGeometry
 
 from tidefield import __version__
 from tidefield.change.cover import LEAST_M2, Cover
-from tidefield.change.errors import Z95, p_values
+from tidefield.change.errors import Z95, colour_limit, p_values
 from tidefield.change.measure import Change
 from tidefield.change.surfaces import PLAIN, Grid, Surface, opened
 from tidefield.change.volumes import Volume
@@ -26,6 +26,7 @@ from tidefield.change.water import Water, Waterline
 from tidefield.errors import need
 from tidefield.files import plain_cell, write_json, write_text
 from tidefield.maps.rasters import Raster, RasterWriter, cog_writer
+from tidefield.maps.styles import PLANTS, SIGNS, Classes, Style, change_ramp
 from tidefield.maps.vectors import Layer, write_geopackage
 
 MOST_OUTLINES = 5000
@@ -33,6 +34,8 @@ MOST_OUTLINES = 5000
 _MOST_POLYGONS_OF_GROUND = 2000
 UNKNOWN = -128.0
 """In significant.tif."""
+SIGNED = "int16"
+"""Of rasters with signs: before GDAL 3.7, QGIS takes signed bytes for unsigned ones."""
 CHANGE_BANDS = (
     "dz: later minus earlier height (m)",
     "sigma: one standard error of dz (m)",
@@ -62,10 +65,16 @@ OUTLINE_FIELDS: tuple[str, ...] = (
 
 @contextmanager
 def cog(
-    path: Path, grid: Grid, bands: tuple[str, ...], kind: str, nodata: float, tags: Mapping[str, str] | None = None
+    path: Path,
+    grid: Grid,
+    bands: tuple[str, ...],
+    kind: str,
+    nodata: float,
+    tags: Mapping[str, str] | None = None,
+    style: Style | None = None,
 ) -> Iterator[RasterWriter]:
     """Write a raster of a grid by rows; it is there, as a Cloud-Optimized GeoTIFF, when the block ends."""
-    raster = Raster(path, bands, kind, nodata, tags=tags or {})
+    raster = Raster(path, bands, kind, nodata, tags=tags or {}, style=style)
     with (
         need("rasterio").Env(GDAL_CACHEMAX=256),
         cog_writer(raster, grid.columns, grid.rows, grid.crs, grid.transform[:6], fast=True) as writer,
@@ -76,10 +85,14 @@ def cog(
 def write_rasters(change: Change, folder: Path) -> None:
     """Write change.tif (`CHANGE_BANDS`) and significant.tif."""
     tags = {"EARLIER": change.earlier.name, "LATER": change.later.name}
+    step = 1 + math.isqrt(change.dz.size // 1_000_000)
+    sizes = np.abs(change.dz[::step, ::step])
+    ramp = change_ramp(1, colour_limit(sizes[np.isfinite(sizes)], change.detection_m[1]) or 1.0)
+    outlined_in = Classes(2, SIGNS)
     lookup = np.concatenate([[0], change.outlines.signs]).astype(np.int8)
     with (
-        cog(folder / "change.tif", change.grid, CHANGE_BANDS, "float32", math.nan, tags) as numbers,
-        cog(folder / "significant.tif", change.grid, SIGNIFICANT_BANDS, "int8", UNKNOWN, tags) as signs,
+        cog(folder / "change.tif", change.grid, CHANGE_BANDS, "float32", math.nan, tags, ramp) as numbers,
+        cog(folder / "significant.tif", change.grid, SIGNIFICANT_BANDS, SIGNED, UNKNOWN, tags, outlined_in) as signs,
     ):
         for rows in change.grid.strips():
             dz = change.dz[rows]
@@ -165,7 +178,7 @@ def write_csv(path: Path, rows: list[dict[str, Any]], fields: Sequence[str] = ()
 
 def write_cover(cover: Cover, folder: Path) -> None:
     """Write cover.tif and cover.csv."""
-    with cog(folder / "cover.tif", cover.grid, COVER_BANDS, "int8", UNKNOWN) as writer:
+    with cog(folder / "cover.tif", cover.grid, COVER_BANDS, SIGNED, UNKNOWN, style=Classes(1, PLANTS)) as writer:
         for rows in cover.grid.strips():
             writer.write(rows.start, cover.classes[rows][None])
     table = [

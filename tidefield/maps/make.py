@@ -44,6 +44,7 @@ from tidefield.maps.orthophoto import render_tile
 from tidefield.maps.rasters import BLOCK, NODATA, Raster, RasterWriter, raster_writer
 from tidefield.maps.report import write_report
 from tidefield.maps.sections import cut, write_sections
+from tidefield.maps.styles import CLASSES_OF_GROUND
 from tidefield.maps.surface import COARSEST, Matched, match, sparse_surface
 from tidefield.maps.terrain import blocks, write_hillshade, write_terrain
 from tidefield.maps.vectors import lost_in_geojson
@@ -67,6 +68,7 @@ CONTOURS, SECTIONS, MASKS = "contours", "sections", "masks"
 CLOUD = "odm_georeferencing/odm_georeferenced_model.laz"
 PRODUCTS = (
     *(ORTHOPHOTO, VIEWS, MAIN, DSM, SIGMA, FILLED, DTM, DSM_HILLSHADE, DTM_HILLSHADE, CLASSES, AGREEMENT, CLOUD),
+    "odm_dem/classes.qml",
     *(f"{CONTOURS}/contours.{suffix}" for suffix in ("gpkg", "geojson", "dxf")),
     *(f"{SECTIONS}/sections.{suffix}" for suffix in ("csv", "svg")),
     *(f"{MASKS}/{name}" for name in ("masks.gpkg", "vegetation.geojson", "water.geojson", "waterline.geojson")),
@@ -408,9 +410,8 @@ def derive(job: Job, out: Path, progress: Callable[[int, int], None]) -> dict[st
     """
     grid, unit = job.grid, job.grid.frame.unit_up
     water = read_water(out / DSM, out / AGREEMENT, out / ORTHOPHOTO, grid)
-    classes = Raster(
-        out / CLASSES, ("class",), "uint8", 0.0, tags={"VALUES": "2 ground, 3 vegetation, 9 water"}, average=False
-    )
+    tags = {"VALUES": "2 ground, 3 vegetation, 9 water"}
+    classes = Raster(out / CLASSES, ("class",), "uint8", 0.0, tags=tags, average=False, style=CLASSES_OF_GROUND)
     write_classes(classes, out / DSM, out / ORTHOPHOTO, water, grid)
     write_masks(out / CLASSES, out / AGREEMENT, water, grid, out / MASKS)
     if lost := lost_in_geojson(grid.frame):

@@ -14,6 +14,7 @@ from jaxtyping import Float64
 from tidefield import SOFTWARE
 from tidefield.errors import RunError, need
 from tidefield.files import completed_file
+from tidefield.maps.styles import Style, write_style
 
 if TYPE_CHECKING:  # it needs PyTorch, which `change` does without
     from tidefield.maps.grid import Grid
@@ -34,6 +35,7 @@ class Raster:
         unit: of the values.
         tags: texts of the file.
         average: overviews are means; otherwise the nearest cell, for numbers that name something.
+        style: how QGIS shows it.
     """
 
     path: Path
@@ -43,6 +45,7 @@ class Raster:
     unit: str = ""
     tags: Mapping[str, str] = field(default_factory=dict)
     average: bool = True
+    style: Style | None = None
 
     @property
     def colour(self) -> bool:
@@ -130,6 +133,8 @@ def cog_writer(
             raise OSError(None, str(error), str(raster.path)) from error
         finally:
             rough.unlink(missing_ok=True)
+    if raster.style is not None:
+        write_style(raster.style, raster.path)
 
 
 def read_values(dataset: Any, band: int | None = None, **how: Any) -> np.ndarray:

@@ -13,16 +13,15 @@ from matplotlib.patches import Patch
 from tidefield import __version__
 from tidefield.errors import need
 from tidefield.files import write_text
-from tidefield.maps.classes import GROUND, VEGETATION, WATER
 from tidefield.maps.figures import INCHES, Extent, map_of, png
 from tidefield.maps.rasters import read_values
+from tidefield.maps.styles import CLASSES_OF_GROUND
 from tidefield.pages import command_line, template_environment
 
 WIDEST = 900
 """Of a picture, cells."""
 _HALF = 4.6
 """Inches of a map that has another next to it."""
-_CLASSES = ((GROUND, "#a07855", "ground"), (VEGETATION, "#3f9b4f", "vegetation"), (WATER, "#2f6fc4", "water"))
 
 
 def write_report(result: dict[str, Any], out: Path, rasters: dict[str, str], fill: bool) -> Path:
@@ -118,10 +117,10 @@ def _scaled(
 
 def _classes(values: np.ndarray, extent: Extent) -> Markup:
     picture = np.zeros((*values.shape[1:], 4), np.uint8)
-    for value, colour, _ in _CLASSES:
+    for value, colour, _ in CLASSES_OF_GROUND.entries:
         picture[values[0] == value] = [*bytes.fromhex(colour[1:]), 255]
     figure, axes = map_of(values.shape[1], values.shape[2], _HALF)
     axes.imshow(picture, extent=extent, interpolation="nearest")
-    handles = [Patch(color=colour, label=name) for _, colour, name in _CLASSES]
+    handles = [Patch(color=colour, label=name) for _, colour, name in CLASSES_OF_GROUND.entries]
     axes.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.12), ncol=3, frameon=False)
     return png(figure, "Classes")
