@@ -60,6 +60,7 @@ def write_geopackage(path: Path, layers: Sequence[Layer], wkt: str) -> None:
                 driver="GPKG",
                 layer=layer.name,
                 append=number > 0,
+                dataset_options={"VERSION": "1.3"},  # which older programs know whole
             )
 
 
