@@ -26,7 +26,7 @@ from tidefield.change.water import Water, Waterline
 from tidefield.errors import need
 from tidefield.files import plain_cell, write_json, write_text
 from tidefield.maps.rasters import Raster, RasterWriter, cog_writer
-from tidefield.maps.styles import PLANTS, SIGNS, Classes, Style, change_ramp
+from tidefield.maps.styles import GAINED, HIGHER, LOST, LOWER, PLANTS, SIGNS, Classes, Lines, Style, change_ramp
 from tidefield.maps.vectors import Layer, write_geopackage
 
 MOST_OUTLINES = 5000
@@ -189,12 +189,12 @@ def write_cover(cover: Cover, folder: Path) -> None:
     write_csv(folder / "cover.csv", table)
 
 
-def _layer(name: str, shapes: list[BaseGeometry], rows: list[dict[str, Any]]) -> Layer:
+def _layer(name: str, shapes: list[BaseGeometry], rows: list[dict[str, Any]], style: Lines | None = None) -> Layer:
     """A layer with a row of fields for each shape."""
     shapes = _multi(shapes)
     kinds = {shape.geom_type for shape in shapes}
     kind = kinds.pop() if kinds in ({"MultiPolygon"}, {"LineString"}) else "Unknown"
-    return Layer(name, kind, shapes, {key: [row[key] for row in rows] for key in rows[0]} if rows else {})
+    return Layer(name, kind, shapes, {key: [row[key] for row in rows] for key in rows[0]} if rows else {}, style)
 
 
 def _cover_layer(cover: Cover) -> Layer:
@@ -205,7 +205,8 @@ def _cover_layer(cover: Cover) -> Layer:
         if shape.area >= LEAST_M2
     ]
     shapes = sorted(shapes, key=lambda pair: -pair[0].area)[:MOST_OUTLINES]
-    return _layer("cover", [shape for shape, _ in shapes], [row for _, row in shapes])
+    style = Lines("cover", (("gained", GAINED), ("lost", LOST)))
+    return _layer("cover", [shape for shape, _ in shapes], [row for _, row in shapes], style)
 
 
 def _water_layer(water: Waterline) -> Layer:
@@ -214,7 +215,8 @@ def _water_layer(water: Waterline) -> Layer:
         for date, level, lines in zip(("earlier", "later"), water.levels_m, water.lines, strict=True)
         for line in lines
     ]
-    return _layer("waterlines", [line for line, _ in rows], [row for _, row in rows])
+    style = Lines("date", (("earlier", LOWER), ("later", HIGHER)))
+    return _layer("waterlines", [line for line, _ in rows], [row for _, row in rows], style)
 
 
 def write_layers(change: Change, folder: Path, cover: Cover | None = None, water: Water | None = None) -> None:
@@ -224,7 +226,8 @@ def write_layers(change: Change, folder: Path, cover: Cover | None = None, water
     for number, polygon in polygons_of(change.outlines.labels, change.grid, change.outlines.labels > 0):
         if number in rows:
             shapes.setdefault(number, []).append(polygon)
-    layers = [_layer("outlines", [shapely.union_all(shapes[k]) for k in rows], list(rows.values()))]
+    style = Lines("change", (("lower", LOWER), ("higher", HIGHER)))
+    layers = [_layer("outlines", [shapely.union_all(shapes[k]) for k in rows], list(rows.values()), style)]
     step = 1 + math.isqrt(change.stable.size // 4_000_000)
     thin = change.stable[::step, ::step]
     ground = [shape for _, shape in polygons_of(thin.astype(np.uint8), change.grid.thinned(step), thin)]

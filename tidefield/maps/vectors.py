@@ -16,6 +16,7 @@ from shapely.geometry.base import BaseGeometry
 from tidefield.errors import need
 from tidefield.files import completed_file, write_text
 from tidefield.geometry.geodesy import WGS84, lost_in_conversion
+from tidefield.maps.styles import Lines, style_of_layer
 
 if TYPE_CHECKING:  # it needs PyTorch, which `change` does without
     from tidefield.maps.grid import MapFrame
@@ -30,12 +31,14 @@ class Layer:
         kind: of the shapes, such as "Polygon"; "Unknown" of several.
         shapes: in map coordinates.
         fields: numbers or texts of each shape.
+        style: how QGIS shows it in a GeoPackage.
     """
 
     name: str
     kind: str
     shapes: Sequence[BaseGeometry]
     fields: Mapping[str, Sequence[float | int | str]]
+    style: Lines | None = None
 
 
 def write_geopackage(path: Path, layers: Sequence[Layer], wkt: str) -> None:
@@ -47,10 +50,11 @@ def write_geopackage(path: Path, layers: Sequence[Layer], wkt: str) -> None:
     Raises:
         RunError: its folder cannot be written to.
     """
+    raw = need("pyogrio").raw
     with completed_file(path, overwrite=True) as partial:
         partial.unlink()  # GDAL makes its own
         for number, layer in enumerate(layers):
-            need("pyogrio").raw.write(
+            raw.write(
                 partial,
                 geometry=np.array([shapely.to_wkb(shape) for shape in layer.shapes], dtype=object),
                 field_data=[np.array(values) for values in layer.fields.values()],
@@ -62,6 +66,38 @@ def write_geopackage(path: Path, layers: Sequence[Layer], wkt: str) -> None:
                 append=number > 0,
                 dataset_options={"VERSION": "1.3"},  # which older programs know whole
             )
+        if styles := _styles(layers):
+            raw.write(
+                partial,
+                geometry=None,
+                field_data=[np.array(values) for values in styles.values()],
+                fields=list(styles),
+                driver="GPKG",
+                layer="layer_styles",
+                append=True,
+            )
+
+
+def _styles(layers: Sequence[Layer]) -> dict[str, Sequence[Any]]:
+    """The columns of the table in which QGIS keeps the styles of a GeoPackage's layers; none without styles."""
+    styled = [(layer.name, style_of_layer(layer.style, "Polygon" in layer.kind)) for layer in layers if layer.style]
+    if not styled:
+        return {}
+    names, texts = zip(*styled, strict=True)
+    count = len(styled)
+    return {
+        "f_table_catalog": [""] * count,
+        "f_table_schema": [""] * count,
+        "f_table_name": names,
+        "f_geometry_column": ["geom"] * count,
+        "styleName": names,
+        "styleQML": texts,
+        "styleSLD": [""] * count,
+        "useAsDefault": [True] * count,
+        "description": [""] * count,
+        "owner": [""] * count,
+        "update_time": [np.datetime64("now", "ms")] * count,
+    }
 
 
 def lost_in_geojson(frame: MapFrame) -> str | None:
