@@ -92,10 +92,9 @@ def reading_from(path: Path) -> Iterator[None]:
     except OSError as error:
         if not user_can_mend(error):
             raise
-        raise RunError(
-            f"{path} cannot be read ({error.strerror or error}): expected one that you may read; ask its owner, or "
-            "name another"
-        ) from error
+        missing = isinstance(error, FileNotFoundError)
+        wanted = "that exists; name another" if missing else "that you may read; ask its owner, or name another"
+        raise RunError(f"{path} cannot be read ({error.strerror or error}): expected one {wanted}") from error
 
 
 def require_writable(*paths: Path, overwrite: bool = False) -> None:

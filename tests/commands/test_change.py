@@ -179,7 +179,7 @@ def test_mistakes_are_told_in_one_message(
     early, late = compared[0].parent / "early_0.tif", compared[0].parent / "late_0.tif"
     new = tmp_path / "new"
     assert "is there already" in fails(capsys, monkeypatch, "change", early, late, compared[0])
-    assert "cannot be read" in fails(capsys, monkeypatch, "change", early, tmp_path / "none.tif", new)
+    assert "expected one that exists" in fails(capsys, monkeypatch, "change", early, tmp_path / "none.tif", new)
     wrong = ("--dates", "2024-05-03", "2023-05-01")
     assert "earlier survey first" in fails(capsys, monkeypatch, "change", early, late, new, *wrong)
     assert "odd numbers" in fails(capsys, monkeypatch, "change", early, late, new, "--windows", 4)

@@ -87,7 +87,7 @@ def test_raw_files_next_to_photographs_are_reported(tmp_path):
 
 
 def test_a_folder_that_does_not_exist_or_has_no_photographs_is_an_error(tmp_path):
-    with pytest.raises(SurveyError, match="is nothing: expected a folder"):
+    with pytest.raises(SurveyError, match="does not exist: expected a folder"):
         read_survey(tmp_path / "gone")
     (tmp_path / "file").write_text("")
     with pytest.raises(SurveyError, match="is a file: expected a folder"):

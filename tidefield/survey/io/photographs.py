@@ -222,8 +222,8 @@ def _list_photographs(folder: Path) -> tuple[list[Path], list[str]]:
     """List the photographs, with remarks on what else is there and not read."""
     try:
         if not folder.is_dir():
-            found = "a file" if folder.exists() else "nothing"
-            raise SurveyError(f"{folder} is {found}: expected a folder of photographs; give one")
+            found = "is a file" if folder.exists() else "does not exist"
+            raise SurveyError(f"{folder} {found}: expected a folder of photographs; give one")
         results: list[Path] = []
         paths = sorted(_walk(folder, _raise, results))
     except OSError as error:
