@@ -71,7 +71,6 @@ def render(options: Render, console: Console) -> None:
     from tidefield.cluster import connected
     from tidefield.device import choose_device
     from tidefield.progress import ProgressBar
-    from tidefield.render.camera_paths import make_trajectory, require_path
     from tidefield.render.stills import describe_view, still_files, title, write_still
 
     out, camera, overwrite = options.out, options.camera, options.overwrite
@@ -95,6 +94,8 @@ def render(options: Render, console: Console) -> None:
             raise TidefieldError(f"--{name} {value} was asked for: expected 16 to 16384 pixels; choose another")
     path, count = options.path or "orbit", FRAMES if options.frames is None else options.frames
     if camera is None:
+        from tidefield.render.camera_paths import require_path
+
         require_path(path, count)  # before photographs are read, which may take minutes
     device, sampling = choose_device(options.device), options.footprint.sampling
     opened = open_source(options.source, options.zero, device, options.allow_missing, console, sampling)
@@ -108,6 +109,7 @@ def render(options: Render, console: Console) -> None:
             return
         width, height = _size(scene.cameras[_usual(scene)], options.width, options.height)
         from tidefield.model.renderer import in_turn
+        from tidefield.render.camera_paths import make_trajectory
         from tidefield.render.video import write_video
 
         trajectory = make_trajectory(path, scene, frames=count, width=width, height=height)
