@@ -18,10 +18,12 @@ from tidefield.synthetic.rays import Pinhole
 from tidefield.synthetic.survey import _near_far
 from tidefield.synthetic.two_dates import Difference, make_pair
 
+VIEWS = 12
+
 
 @cache
-def survey(category: str = "tidal_trees") -> Survey:
-    return make_survey(category, seed=4, views=30, width=96, supersample=1)
+def survey(category: str = "tidal_trees", views: int = VIEWS) -> Survey:
+    return make_survey(category, seed=4, views=views, width=96, supersample=1)
 
 
 def points_of(survey: Survey, view: int) -> torch.Tensor:
@@ -59,7 +61,7 @@ def test_error_for_an_unknown_category_lists_the_categories() -> None:
 
 
 def test_depth_points_lie_on_the_ground_or_on_plants_above_it() -> None:
-    points = torch.cat([points_of(survey("vegetation"), v) for v in range(0, 30, 6)]).T
+    points = torch.cat([points_of(survey("vegetation"), v) for v in range(0, VIEWS, 3)]).T
     above = points[2] - survey("vegetation").flat.surface.sample(points[:2])[0]
     assert above.min() > -3e-4
     on_ground = above < 3e-4
@@ -144,7 +146,7 @@ def test_orthophoto_matches_a_camera_far_above() -> None:
 @pytest.mark.thorough
 @pytest.mark.parametrize("category", list(CATEGORIES))
 def test_every_category_has_overlap_contrast_and_sparse_points(category: str) -> None:
-    scene = survey(category)
+    scene = survey(category, views=30)
     assert scene.photographs.shape == (30, 72, 96, 3)
     assert torch.isfinite(scene.depth).all()
     near, far = scene.cameras.near_far.T
@@ -172,7 +174,7 @@ def test_categories_differ_as_their_names_say() -> None:
 
 
 def test_gains_and_moving_water_are_optional() -> None:
-    assert torch.equal(survey().cameras.gain, torch.ones(30, 3))
+    assert torch.equal(survey().cameras.gain, torch.ones(VIEWS, 3))
     flight = Flight(exposure_spread=0.2, water_motion=1.5)
     scene = make_survey("tidal_trees", seed=4, views=3, width=96, flight=flight, supersample=1)
     gain = scene.cameras.gain
@@ -220,18 +222,18 @@ def test_near_and_far_ignore_the_sky() -> None:
 
 
 def test_flight_options_reach_the_flat_and_the_poses() -> None:
-    low = make_survey("ground_textures", 4, views=2, width=48, flight=Flight(sun_elevation_deg=12.0), supersample=1)
+    low = make_survey("ground_textures", 4, views=2, width=16, flight=Flight(sun_elevation_deg=12.0), supersample=1)
     assert float(low.flat.light.sun[2]) == pytest.approx(np.sin(np.radians(12.0)))
     wet, dry = (
-        make_survey("ground_textures", 4, views=2, width=48, flight=Flight(wetness=w), supersample=1).flat.ground
+        make_survey("ground_textures", 4, views=2, width=16, flight=Flight(wetness=w), supersample=1).flat.ground
         for w in (1.0, 0.0)
     )
     assert wet.maps.values[5].mean() > dry.maps.values[5].mean() + 0.2
-    oblique = make_survey("ground_textures", 4, views=4, width=48, flight=Flight(oblique_share=1.0), supersample=1)
+    oblique = make_survey("ground_textures", 4, views=4, width=16, flight=Flight(oblique_share=1.0), supersample=1)
     tilt_deg = torch.rad2deg(torch.arccos(-oblique.cameras.forward_world[:, 2]))
     assert tilt_deg.min() > 18
     assert tilt_deg.max() < 52
-    assert torch.equal(survey().cameras.forward_world[:, 2] < -0.98, torch.ones(30, dtype=torch.bool))
+    assert torch.equal(survey().cameras.forward_world[:, 2] < -0.98, torch.ones(VIEWS, dtype=torch.bool))
 
 
 def test_flight_options_reach_large_flights() -> None:
