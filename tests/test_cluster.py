@@ -98,6 +98,7 @@ def test_an_error_of_the_function_is_raised_as_it_is(address):
         list(on_cluster(ray, "wrong", prepare, [7]))
 
 
+@pytest.mark.thorough
 def test_a_killed_worker_costs_one_task_and_nothing_else(address, tmp_path: Path):
     @contextmanager
     def prepare():
@@ -151,6 +152,7 @@ def test_an_item_of_a_group_comes_when_it_is_done(address, tmp_path: Path):
     assert found == [0, 1, 2, 3]
 
 
+@pytest.mark.thorough
 def test_a_killed_worker_s_group_goes_on_where_it_was(address, tmp_path: Path):
     @contextmanager
     def prepare():

@@ -41,6 +41,7 @@ def scene(flat, tmp_path_factory: pytest.TempPathFactory):
     return load_scene(folder / "scene", cache=folder / "cache")
 
 
+@pytest.mark.thorough
 def test_views_over_borders_have_an_area_on_each_side(scene):
     areas = AREAS(scene)
     assert len(areas) == 4
@@ -58,6 +59,7 @@ def test_views_over_borders_have_an_area_on_each_side(scene):
         assert len(sides) == 2
 
 
+@pytest.mark.thorough
 def test_a_step_at_borders_is_found_and_elsewhere_there_is_none(scene, flat):
     def render(camera):
         truth, depth = flat.photograph(replace(camera, T_world_camera=_in_world(camera, scene)), 2)
@@ -71,6 +73,7 @@ def test_a_step_at_borders_is_found_and_elsewhere_there_is_none(scene, flat):
     assert found["inside_largest"] == pytest.approx(0, abs=1e-3)
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_training_by_areas_leaves_no_seam_on_flat_mud(scene, flat):
     areas, config = AREAS(scene), PRESETS["swift"]
@@ -136,6 +139,7 @@ def test_comparisons_of_earlier_versions_are_shown_with_their_flight():
     assert "| by areas (8) | 34.65 |" in seams
 
 
+@pytest.mark.thorough
 def test_a_view_does_not_depend_on_the_area_that_is_open(scene):
     trainer = SceneTrainer(SMALL, scene, 0, torch.device("cpu"), areas=AREAS(scene))
     camera = scene.cameras[scene.test[1]].resized(48, 36)

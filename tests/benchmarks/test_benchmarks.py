@@ -88,6 +88,7 @@ def test_a_window_holds_rays_of_its_camera(rays: int) -> None:
     assert (corner[0] + part.size_px <= camera.size_px).all()
 
 
+@pytest.mark.thorough
 def test_speed_is_measured_stage_by_stage_and_leaves_no_trace() -> None:
     scene = wall.scene(wall.cameras(4))
     before = torch.Tensor.backward

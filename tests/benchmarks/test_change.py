@@ -110,6 +110,7 @@ def chain(pair, tmp_path_factory):
     return folder
 
 
+@pytest.mark.thorough
 def test_photographs_of_the_chain_come_with_control_that_fits_them(pair, chain):
     import torch
 
@@ -171,6 +172,7 @@ def test_control_stands_under_no_plant_wherever_the_marsh_is(pair, monkeypatch):
         assert float(above.max()) < flights.BARE_M
 
 
+@pytest.mark.thorough
 def test_bare_ground_of_the_chain_has_no_plants_on_it(pair, chain):
     from benchmarks import change_chain
     from tidefield.change.surfaces import Grid

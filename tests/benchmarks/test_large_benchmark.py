@@ -17,6 +17,7 @@ time.sleep(0.8)
 """
 
 
+@pytest.mark.thorough
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_time_and_memory_are_counted_for_the_stage_that_runs():
     stages = run_by_stage([sys.executable, "-c", STAGES], threads=1)

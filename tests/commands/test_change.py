@@ -363,6 +363,7 @@ def test_mistakes_in_any_survey_of_a_series_are_found_before_the_first_is_compar
         call("change", first, second, tmp_path / "out", "--series", geoid)
 
 
+@pytest.mark.thorough
 def test_surveys_of_a_series_have_one_name_in_all_comparisons_and_each_result_is_given_up_before_the_next(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

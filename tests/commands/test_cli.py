@@ -471,6 +471,7 @@ def test_help_does_not_import_torch() -> None:
     assert done.stdout.endswith("fine\n"), time.monotonic() - start
 
 
+@pytest.mark.thorough
 def test_surfaces_and_clouds_are_compared_without_torch(tmp_path: Path) -> None:
     modules = ", ".join(f"tidefield.change.{name}" for name in ("inputs", "measure", "cover", "water", "write", "page"))
     rng = np.random.default_rng(0)

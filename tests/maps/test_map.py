@@ -162,6 +162,7 @@ def test_the_point_cloud_has_a_point_of_every_cell(out: Path):
     assert "not georeferenced" in cloud.header.parse_crs().name
 
 
+@pytest.mark.thorough
 def test_a_map_that_was_killed_continues_and_is_the_same(scene: Path, out: Path, tmp_path: Path):
     rendered, again = make.render_tile, []
 
@@ -213,6 +214,7 @@ def test_a_finished_or_foreign_folder_is_not_overwritten(scene: Path, out: Path,
     assert (out / MAP_FILE).read_bytes() == before
 
 
+@pytest.mark.thorough
 def test_a_filled_map_has_no_holes_even_where_no_two_photographs_see_a_tile(
     scene: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ):

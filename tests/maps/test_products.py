@@ -96,6 +96,7 @@ def test_rims_that_matching_widens_are_taken_off(tmp_path: Path):
     np.testing.assert_allclose(terrain[away > 38], bare[away > 38], atol=1e-5)
 
 
+@pytest.mark.thorough
 def test_the_terrain_of_a_long_coast_is_that_of_its_plane(tmp_path: Path):
     coast = replace(GRID, columns=33_000, rows=8)
     rows, columns = np.ogrid[: coast.rows, : coast.columns]

@@ -215,6 +215,7 @@ def test_maps_have_no_more_texels_than_are_counted_with_32_bits(network: Network
     assert max(len(maps.rows) for maps in feature_cache._maps(limited._encoded)) == 12 * 128**2
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("small_blocks")
 def test_a_gpu_encodes_photographs_that_were_read_at_the_same_time(network: Network, monkeypatch: pytest.MonkeyPatch):
     at, readers = scene(), set[str]()

@@ -69,11 +69,13 @@ def evaluation(trained: tuple[Path, Path]) -> tuple[Scene, Path, float]:
     return scene, folder / "own", evaluate(render, scene, folder / "own", configuration={}).mean["psnr"]
 
 
+@pytest.mark.thorough
 def test_ns_eval_measures_what_evaluate_measures(trained: tuple[Path, Path], evaluation: tuple[Scene, Path, float]):
     found = json.loads((trained[0] / "eval.json").read_text())["results"]["psnr"]
     assert found == pytest.approx(evaluation[2], abs=0.05)
 
 
+@pytest.mark.thorough
 def test_ns_render_shows_what_evaluate_shows(trained: tuple[Path, Path], evaluation: tuple[Scene, Path, float]):
     scene, own, _ = evaluation
     for name in (scene.names[i] for i in scene.test):
@@ -84,6 +86,7 @@ def test_ns_render_shows_what_evaluate_shows(trained: tuple[Path, Path], evaluat
         assert np.abs(pictures[0] - pictures[1]).mean() < 1
 
 
+@pytest.mark.thorough
 def test_the_run_holds_the_way_back_to_the_reference_system(trained: tuple[Path, Path]):
     folder, out = trained
     found = json.loads((out / "dataparser_transforms.json").read_text())

@@ -191,6 +191,7 @@ def test_mapping_opens_no_database_that_another_process_may_be_opening(survey, t
     assert merge(parts, database)[0].num_reg_images() == len(photographs), "photographs keep their numbers"
 
 
+@pytest.mark.thorough
 def test_a_killed_process_is_one_error_that_says_how_to_go_on(survey, tmp_path: Path, monkeypatch):
     flight, database = survey
     names = tuple(p.name for p in flight.survey.photographs)

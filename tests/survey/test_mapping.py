@@ -228,6 +228,7 @@ def simulated_matches(path: Path) -> list[str]:
     return [image.name for image in truth.images.values()]
 
 
+@pytest.mark.thorough
 def test_ctrl_c_ends_the_global_mapper_because_it_has_a_process_of_its_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
@@ -237,6 +238,7 @@ def test_ctrl_c_ends_the_global_mapper_because_it_has_a_process_of_its_own(
     assert registered_names(model) == sorted(names)
 
 
+@pytest.mark.thorough
 def test_a_photograph_that_sees_no_point_is_in_no_model(tmp_path: Path):
     names = simulated_matches(tmp_path / "database.db")
     with pycolmap.Database.open(tmp_path / "database.db") as db:

@@ -92,6 +92,7 @@ def test_the_stream_keeps_a_pool_of_scenes(tmp_path: Path, monkeypatch: pytest.M
         assert left <= {"7-000004", "7-000005", "7-000006"}, "the fourth was made, and drawn by nobody"
 
 
+@pytest.mark.thorough
 def test_only_processes_that_make_scenes_have_one_core(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stream, "make_survey", lambda *_: None)
     monkeypatch.setattr(stream, "misposed", lambda *_: None)

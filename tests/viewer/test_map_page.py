@@ -139,6 +139,7 @@ def test_what_is_measured_on_a_map_without_a_georeference_is_in_units(tmp_path: 
     assert re.search(r"[\d.]+ cubic units", found["area"])
 
 
+@pytest.mark.thorough
 def test_what_is_measured_on_a_scene_a_few_units_wide_is_not_rounded_away(tmp_path: Path, browser):
     rows, columns = np.indices(SHAPE)
     heap = 0.02 * np.exp(-((rows - 40) ** 2 + (columns - 50) ** 2) / 50)
@@ -178,6 +179,7 @@ def test_a_section_shows_the_change_where_maps_have_no_heights(tmp_path: Path, b
         tab.close()
 
 
+@pytest.mark.thorough
 def test_surveys_of_a_section_have_colours_of_their_own(tmp_path: Path, browser):
     rows, columns = np.indices(SHAPE)
     maps = [
@@ -267,6 +269,7 @@ def test_on_a_phone_nothing_leaves_the_screen(tmp_path: Path, browser):
         context.close()
 
 
+@pytest.mark.thorough
 def test_the_address_keeps_a_detection_of_zero_and_a_new_one_shows_nothing_that_it_lacks(tmp_path: Path, browser):
     change = write_change(tmp_path / "change", np.full(SHAPE, 0.03, np.float32))
     with page_of(change) as page:
