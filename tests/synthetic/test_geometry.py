@@ -74,7 +74,7 @@ def test_plant_depths_match_brute_force() -> None:
     ]
     for view in views:
         depth, number = plants.nearest(view)
-        ray = torch.arange(0, len(depth), len(depth) // 120)
+        ray = torch.arange(0, len(depth), len(depth) // 250)
         origin, direction = (x.expand(3, len(ray)).double().numpy() for x in view.rays(ray))
         expected = np.array([brute_force(plants, o, d) for o, d in zip(origin.T, direction.T, strict=True)])
         hit = np.isfinite(expected)
