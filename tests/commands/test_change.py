@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import weakref
 from pathlib import Path
 
@@ -74,6 +75,11 @@ def test_the_rasters_are_cloud_optimized_and_have_what_their_bands_say(compared:
         assert file.tags()["EARLIER"] == "2023-05-01"
     with rasterio.open(out / "significant.tif") as file:
         alone, outlined = file.read()
+        assert file.dtypes == ("int16", "int16")  # before GDAL 3.7, signed bytes are read as unsigned ones
+    limit = re.search(r'classificationMax="([^"]+)"', (out / "change.qml").read_text())
+    assert limit is not None
+    assert np.abs(dz).max() / 2 < float(limit[1]) <= np.abs(dz).max()
+    assert 'type="paletted"' in (out / "significant.qml").read_text()
     assert np.array_equal(alone != 0, p < 0.05)
     assert np.abs((dz - truth)[truth == 0].mean()) < 0.002
     assert (outlined[truth < 0] == -1).mean() > 0.95
@@ -231,7 +237,8 @@ def test_plants_and_water_are_told_where_orthophotos_and_levels_are_given(tmp_pa
     assert numbers["water"]["below"][0]["earlier_m2"] == pytest.approx(100 * 160 * 0.25, rel=0.02)
     with rasterio.open(out / "cover.tif") as file:
         assert set(np.unique(file.read(1))) == {-128, 0, 1, 2}
-    assert {name for name, _ in pyogrio.list_layers(out / "change.gpkg")} >= {"cover", "waterlines"}
+        assert file.dtypes == ("int16",)
+    assert {name for name, _ in pyogrio.list_layers(out / "change.gpkg")} >= {"cover", "waterlines", "layer_styles"}
     page = (out / "change.html").read_text()
     assert "Plants covered" in page
     assert "seaward on average" in page

@@ -18,8 +18,8 @@ from tidefield.change.errors import Z95
 from tidefield.change.measure import Change
 from tidefield.change.surfaces import Grid
 from tidefield.change.water import Waterline
-from tidefield.maps.figures import INCHES, INK, RULE, SOFT, Extent, figure_of, map_of, png
-from tidefield.maps.styles import HIGHER, LOWER, PLANTS
+from tidefield.maps.figures import INCHES, RULE, SOFT, Extent, figure_of, map_of, png
+from tidefield.maps.styles import HIGHER, INK, LOWER, PLANTS
 from tidefield.maps.terrain import hillshade
 
 STABLE = "#7a9a3a"

@@ -21,8 +21,8 @@ from tidefield.change.page import cubic
 from tidefield.change.volumes import Volume
 from tidefield.change.write import write_csv
 from tidefield.files import write_json, write_text
-from tidefield.maps.figures import INK, RULE, SOFT, figure_of, png
-from tidefield.maps.styles import HIGHER, LOWER
+from tidefield.maps.figures import RULE, SOFT, figure_of, png
+from tidefield.maps.styles import HIGHER, INK, LOWER
 from tidefield.pages import template_environment
 
 _MOST_PLOTS = 12

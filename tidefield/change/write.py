@@ -26,7 +26,7 @@ from tidefield.change.water import Water, Waterline
 from tidefield.errors import need
 from tidefield.files import plain_cell, write_json, write_text
 from tidefield.maps.rasters import Raster, RasterWriter, cog_writer
-from tidefield.maps.styles import GAINED, HIGHER, LOST, LOWER, PLANTS, SIGNS, Classes, Lines, Style, change_ramp
+from tidefield.maps.styles import GAINED, HIGHER, INK, LOST, LOWER, PLANTS, SIGNS, Classes, Lines, Style, change_ramp
 from tidefield.maps.vectors import Layer, write_geopackage
 
 MOST_OUTLINES = 5000
@@ -215,7 +215,7 @@ def _water_layer(water: Waterline) -> Layer:
         for date, level, lines in zip(("earlier", "later"), water.levels_m, water.lines, strict=True)
         for line in lines
     ]
-    style = Lines("date", (("earlier", LOWER), ("later", HIGHER)))
+    style = Lines("date", (("earlier", INK), ("later", HIGHER)))
     return _layer("waterlines", [line for line, _ in rows], [row for _, row in rows], style)
 
 

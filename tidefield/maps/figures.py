@@ -12,7 +12,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-INK, SOFT, RULE = "#1c2328", "#55626b", "#d5dbdf"
+from tidefield.maps.styles import INK
+
+SOFT, RULE = "#55626b", "#d5dbdf"
 INCHES = 7.6
 """Width of a map."""
 _DPI = 130

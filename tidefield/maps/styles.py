@@ -9,6 +9,7 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 from tidefield.files import write_text
 from tidefield.maps.classes import GROUND, VEGETATION, WATER
 
+INK = "#1c2328"
 LOWER, HIGHER = "#b2182b", "#2166ac"
 GAINED, LOST, STANDING = "#1a7a3c", "#b8742a", "#b9c8a0"
 _LOWER_TO_HIGHER = (LOWER, "#f4a582", "#f7f7f7", "#92c5de", HIGHER)
