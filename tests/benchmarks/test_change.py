@@ -219,7 +219,7 @@ def test_a_work_folder_of_other_options_is_refused(tmp_path, monkeypatch):
             change_chain.change_chain(tmp_path / "chain", 9, width, tmp_path)
     (tmp_path / "chain" / "surveys").mkdir()
     (tmp_path / "chain" / "surveys" / "truth.npz").touch()
-    with pytest.raises(SurveyError, match="photographs is nothing"):  # the same options go on with what is there
+    with pytest.raises(SurveyError, match="photographs does not exist"):  # the same options go on with what is there
         change_chain.change_chain(tmp_path / "chain", 9, 48, tmp_path)
     with pytest.raises(RunError, match=r"chain holds files of .*'width_px': 48.*: expected .*'width_px': 800"):
         change_chain.change_chain(tmp_path / "chain", 9, 800, tmp_path)

@@ -126,20 +126,22 @@ def require_path(path: str, frames: int) -> None:
         raise TidefieldError(f"no camera path is called {path!r}: expected {', '.join(SHAPES)} or a .json file")
 
 
-def make_trajectory(path: str, scene: Scene, *, frames: int, width: int, height: int) -> Trajectory:
+def make_trajectory(
+    path: str, scene: Scene, *, frames: int, width: int, height: int, frames_per_second: float = FRAMES_PER_SECOND
+) -> Trajectory:
     """Make the camera path of a name or a file.
 
     Args:
         path: `cameras`, `orbit`, `strip`, or a camera-path JSON as nerfstudio's viewer exports it.
         scene: its training cameras and sparse points determine the path.
-        frames, width, height: of the video, pixels; a JSON has its own instead.
+        frames, width, height, frames_per_second: of the video, pixels; a JSON has its own instead.
 
     Raises:
         TidefieldError: the name is none of these, it would have no frames, or the file cannot be read as a camera path.
     """
     require_path(path, frames)
     if path in SHAPES:
-        return Trajectory(_well_seen(SHAPES[path], scene, frames, width, height), FRAMES_PER_SECOND)
+        return Trajectory(_well_seen(SHAPES[path], scene, frames, width, height), frames_per_second)
     stored = read_nerfstudio_path(Path(path), scene.root)
     position = stored.position - scene.origin_world.double().cpu().numpy()
     cameras = path_cameras(scene, position, stored.rotation, stored.width, stored.height, stored.focal_px)
