@@ -47,6 +47,11 @@ from tidefield.train.checkpoint import (
 from tidefield.train.loop import SceneTrainer
 
 QUIET = Console(quiet=True)
+PLAIN = replace(
+    SMALL,
+    network=replace(SMALL.network, without=(*SMALL.network.without, "matched surface", "doubled photographs")),
+)
+"""Nothing here is about surfaces, whose search takes most of the time of a small scene."""
 
 
 class Killed(BaseException):
@@ -57,10 +62,11 @@ class Killed(BaseException):
 def small(tmp_path_factory: pytest.TempPathFactory) -> Any:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        patch.setitem(PRESETS, "swift", SMALL)
+        patch.setitem(PRESETS, "swift", PLAIN)
         patch.setattr(checkpoint, "SHIPPED", tmp_path_factory.mktemp("weights"))
+        patch.setattr(loop, "PICTURE_PX", 24)
         torch.manual_seed(5)
-        write_weights(checkpoint.SHIPPED / "swift.safetensors", make_network(SMALL.network), SMALL, {})
+        write_weights(checkpoint.SHIPPED / "swift.safetensors", make_network(PLAIN.network), PLAIN, {})
         yield
 
 
@@ -71,7 +77,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def start(scene: Path, run: Path, steps: int = 3, **options: Any) -> None:
+def start(scene: Path, run: Path, steps: int = 1, **options: Any) -> None:
     train(Train(scene, run, width=48, budget=Budget(steps=steps), device="cpu", **options), QUIET)
 
 
@@ -86,7 +92,7 @@ def start_and_kill(patch: pytest.MonkeyPatch, scene: Path, run: Path, **options:
 
 
 def state(run: Path) -> dict[str, torch.Tensor]:
-    network = make_network(SMALL.network)
+    network = make_network(PLAIN.network)
     load_network(run, network)
     return network.state_dict()
 
@@ -178,7 +184,7 @@ def test_a_run_that_starts_again_needs_the_weights_it_started_from(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     other = tmp_path / "w.safetensors"
-    write_weights(other, make_network(SMALL.network), SMALL, {})
+    write_weights(other, make_network(PLAIN.network), PLAIN, {})
     start_and_kill(monkeypatch, scene, tmp_path / "run", weights=other)
     with pytest.raises(RunError, match="name them with --weights"):
         start(scene, tmp_path / "run", resume=True)
@@ -221,7 +227,7 @@ def test_a_run_is_continued_to_the_end_of_its_own_budget_unless_another_is_given
     assert read_run(run).budget == Budget(steps=3)
     for budget, steps in ((Budget(steps=5), 5), (Budget(), 5), (Budget(steps=6), 6)):
         train(Train(scene, run, budget=budget, device="cpu", resume=True), QUIET)
-        assert load_network(run, make_network(SMALL.network)).step == steps
+        assert load_network(run, make_network(PLAIN.network)).step == steps
         assert read_run(run).budget == Budget(steps=steps)
 
 
@@ -251,7 +257,7 @@ def test_a_run_is_not_continued_with_the_options_of_another(
 def test_a_run_that_has_saved_is_not_continued_from_other_weights(scene: Path, tmp_path: Path) -> None:
     start(scene, tmp_path / "run")
     other = tmp_path / "w.safetensors"
-    write_weights(other, make_network(SMALL.network), SMALL, {})
+    write_weights(other, make_network(PLAIN.network), PLAIN, {})
     with pytest.raises(RunError, match=r"was not started with --weights .*w\.safetensors: "):
         start(scene, tmp_path / "run", resume=True, weights=other)
     start(scene, tmp_path / "run", resume=True, weights=checkpoint.SHIPPED / "swift.safetensors")
@@ -262,7 +268,7 @@ def test_a_folder_is_trained_into_by_one_process_at_a_time(scene: Path, tmp_path
     for options in ({"resume": True}, {"overwrite": True}):
         with only_writer(tmp_path / "run"), pytest.raises(RunError, match="another process is writing to"):
             start(scene, tmp_path / "run", **options)
-    start(scene, tmp_path / "run", steps=4, resume=True)
+    start(scene, tmp_path / "run", steps=2, resume=True)
 
 
 def test_what_killed_saves_have_left_is_swept_when_a_run_is_continued(scene: Path, tmp_path: Path) -> None:
@@ -272,7 +278,7 @@ def test_what_killed_saves_have_left_is_swept_when_a_run_is_continued(scene: Pat
     for name in left:
         (tmp_path / "run" / name).touch()
     (tmp_path / "run" / ".flight-0123abcd.partial.mp4").touch()  # a live `render` may be writing it
-    start(scene, tmp_path / "run", steps=4, resume=True)
+    start(scene, tmp_path / "run", steps=2, resume=True)
     assert {file for file in files(tmp_path / "run") if "tensorboard" not in file} == {
         *(file for file in there if "tensorboard" not in file),
         ".flight-0123abcd.partial.mp4",
@@ -307,7 +313,6 @@ def test_curves_over_steps_of_programs_that_have_none_are_refused(scene: Path, t
 
 def test_the_picture_of_a_training_is_a_small_one(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shapes: list[tuple[int, ...]] = []
-    monkeypatch.setattr(loop, "PICTURE_PX", 24)
 
     def add_image(writer: object, tag: str, picture: Any, *_: object, **__: object) -> None:
         shapes.append(picture.shape)
@@ -344,7 +349,7 @@ def test_an_evaluation_of_another_run_is_not_compared(scene: Path, tmp_path: Pat
     evaluate(Evaluate(run, device="cpu"), QUIET)
     assert read_evaluation(run) == json.loads((run / "evaluation.json").read_text())
     assert read_evaluation(run)["configuration"]["run"] == read_run(run).id
-    write_run(run, checkpoint.Run(scene, 48, 0, SMALL))
+    write_run(run, checkpoint.Run(scene, 48, 0, PLAIN))
     with pytest.raises(RunError, match="of another run"):
         read_evaluation(run)
 
@@ -356,14 +361,14 @@ def test_a_run_whose_scene_was_made_anew_does_not_go_on(
     shutil.copytree(scene, again)
     start(again, run)
     evaluate(Evaluate(run, device="cpu"), QUIET)
-    start(again, run, steps=4, resume=True)
+    start(again, run, steps=2, resume=True)
     assert not caplog.messages
     other = survey(PINHOLE)
     other.T_world_camera[:, :, 3] *= 1.01
     write_colmap(again, replace(other, ground=1.01 * other.ground))
     with pytest.raises(RunError, match=r"has other photographs or poses than when .* was started"):
-        start(again, run, steps=5, resume=True)
-    assert read_run(run).budget == Budget(steps=4)
+        start(again, run, steps=3, resume=True)
+    assert read_run(run).budget == Budget(steps=2)
     evaluate(Evaluate(run, device="cpu", overwrite=True), QUIET)
     assert [text for text in caplog.messages if "other photographs or poses than when" in text]
 
@@ -411,7 +416,7 @@ def test_a_run_does_not_go_on_with_photographs_that_it_held_out(
     (again / "transforms.json").write_text(json.dumps({k: [f"images/{n}" for n in v] for k, v in lists.items()}))
     for options in ({}, {"allow_missing": True}):
         with pytest.raises(RunError, match="or holds out others"):
-            start(again, run, steps=4, resume=True, **options)
+            start(again, run, steps=2, resume=True, **options)
     with pytest.raises(RunError, match=r"was trained when .* not held out: expected photographs that it did not learn"):
         evaluate(Evaluate(run, device="cpu"), QUIET)
     assert [text for text in caplog.messages if "or holds out others" in text]
@@ -429,7 +434,7 @@ def test_the_same_command_with_resume_goes_on(tmp_path: Path, scene: Path, optio
     _require_its_options(replace(started, resume=True), replace(run, variant=None))  # of an older version
     for other, named in (({"method": "nerf"}, "--method nerf"), ({"variant": "views-2"}, "--variant views-2")):
         with pytest.raises(RunError, match=f"was not started with .*{named}"):
-            _require_its_options(Train(scene, tmp_path / "run", **other), replace(run, config=SMALL, variant=None))
+            _require_its_options(Train(scene, tmp_path / "run", **other), replace(run, config=PLAIN, variant=None))
 
 
 def test_a_run_goes_on_with_some_of_its_options_though_its_preset_has_changed_since(

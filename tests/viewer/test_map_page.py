@@ -49,7 +49,7 @@ def page_of(*folders: Path) -> Iterator[MapPage]:
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[object]:
-    with open_browser() as opened:
+    with open_browser(webgl=False) as opened:
         yield opened
 
 
