@@ -53,7 +53,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def run(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "run"
-    call("train", scene, folder, "--steps", 3, "--device", "cpu", "-q")
+    call("train", scene, folder, "--steps", 1, "--device", "cpu", "-q")
     return folder
 
 
@@ -136,8 +136,8 @@ def test_resume_goes_on_from_the_last_step(scene: Path, run: Path, capsys: pytes
     from tidefield.model.network import make_network
     from tidefield.train.checkpoint import load_network, read_run
 
-    call("train", scene, run, "--steps", 5, "--resume", "-q")
-    assert load_network(run, make_network(read_run(run).config.network)).step == 5
+    call("train", scene, run, "--steps", 2, "--resume", "-q")
+    assert load_network(run, make_network(read_run(run).config.network)).step == 2
     capsys.readouterr()
     call("train", scene, run, "--resume")
     assert "the budget was used before" in capsys.readouterr().out
