@@ -73,7 +73,6 @@ def test_a_step_at_borders_is_found_and_elsewhere_there_is_none(scene, flat):
     assert found["inside_largest"] == pytest.approx(0, abs=1e-3)
 
 
-@pytest.mark.thorough
 @pytest.mark.slow
 def test_training_by_areas_leaves_no_seam_on_flat_mud(scene, flat):
     areas, config = AREAS(scene), PRESETS["swift"]
