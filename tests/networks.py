@@ -21,6 +21,11 @@ SMALL = replace(
     network=replace(SWIFT.network, encoder=EncoderConfig((8, 8, 8, 8), (1, 1, 1), False), views=3),
     train=replace(SWIFT.train, tiles=1, tile_px=16, crop_px=48),
 )
+PLAIN = replace(
+    SMALL,
+    network=replace(SMALL.network, without=(*SMALL.network.without, "matched surface", "doubled photographs")),
+)
+"""For what is not about surfaces, whose search takes most of the time of a small scene."""
 SMALL_PAPER = replace(
     PAPER.network,
     encoder=EncoderConfig(widths=(8, 8, 12, 16), blocks=(1, 1, 1), instance_norm=True),

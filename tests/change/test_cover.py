@@ -7,9 +7,11 @@ import cv2
 import numpy as np
 import pytest
 import shapely
+from markupsafe import Markup
 from pyproj import CRS
 from surveys_of_two_dates import NORTH, WEST, write_surface
 
+from tidefield.change import figures
 from tidefield.change.cover import compare_cover, measure_cover
 from tidefield.change.light import light_gains, with_light
 from tidefield.change.measure import measure
@@ -202,7 +204,8 @@ def test_films_are_left_out_where_pixels_show_leaves_however_long_the_survey(
     assert found.areas["all"]["earlier"].value_m2 == pytest.approx(true, rel=0.2)
 
 
-def test_the_page_states_whether_films_and_shallow_water_count(tmp_path: Path):
+def test_the_page_states_whether_films_and_shallow_water_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(figures, "png", lambda *_: Markup("<img>"))
     rng = np.random.default_rng(0)
     paths = [write_surface(tmp_path / f"{k}.tif", rng.normal(0, 0.02, (60, 80)).astype(np.float32)) for k in (0, 1)]
     change = measure(open_surface(paths[0]), open_surface(paths[1]))

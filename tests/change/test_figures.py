@@ -11,10 +11,15 @@ from surveys_of_two_dates import NORTH, WEST, pair, write_surface
 
 from tidefield.change import figures
 from tidefield.change.cover import compare_cover
-from tidefield.change.measure import Options, measure
+from tidefield.change.measure import Change, measure
 from tidefield.change.page import sentences
 from tidefield.change.surfaces import Grid, open_surface
 from tidefield.change.volumes import Volume
+
+
+@pytest.fixture(scope="module")
+def change(tmp_path_factory: pytest.TempPathFactory) -> Change:
+    return measure(*(open_surface(path) for path in pair(tmp_path_factory.mktemp("pair"), 0, 0.1)[:2]))
 
 
 def middle(grid: Grid, row: int, column: int) -> tuple[float, float]:
@@ -22,9 +27,8 @@ def middle(grid: Grid, row: int, column: int) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("side", [100, 1400])
-def test_cells_of_a_page_lie_where_those_of_the_survey_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, side: int):
+def test_cells_of_a_page_lie_where_those_of_the_survey_do(change: Change, monkeypatch: pytest.MonkeyPatch, side: int):
     monkeypatch.setattr(figures, "_SIDE", side)
-    change = measure(*(open_surface(path) for path in pair(tmp_path, 0, 0.10)[:2]))
     small = figures.thinned(change)
     step = 3 if side == 100 else 1
     assert small.grid.shape == small.dz.shape == small.heights.shape == (-(-200 // step), -(-240 // step))
@@ -36,9 +40,11 @@ def test_cells_of_a_page_lie_where_those_of_the_survey_do(tmp_path: Path, monkey
 
 
 def test_what_takes_long_is_named_before_it_is_done(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    rng = np.random.default_rng(0)
+    paths = [write_surface(tmp_path / f"{k}.tif", rng.normal(0, 0.02, (30, 40)).astype(np.float32)) for k in (0, 1)]
     with caplog.at_level("INFO", "tidefield"):
-        measure(*(open_surface(path) for path in pair(tmp_path, 0, 0.10)[:2]))
-    for step in ("comparing 200 x 240 cells of 0.5 m", "finding stable ground", "outlining change"):
+        measure(*map(open_surface, paths))
+    for step in ("comparing 30 x 40 cells of 0.5 m", "finding stable ground", "outlining change"):
         assert step in caplog.text
 
 
@@ -59,23 +65,20 @@ def test_a_narrow_strip_keeps_two_rows_to_be_drawn(tmp_path: Path, monkeypatch: 
         (-100.0, 100.0, "the ground changed by \u2212100 m³ (95%: \u2212296 to 96.0 m³) in all on 400 m², which"),
     ],
 )
-def test_a_volume_in_words_has_the_sign_of_its_interval(value_m3: float, sigma_m3: float, words: str, tmp_path: Path):
-    change = measure(*(open_surface(path) for path in pair(tmp_path, 0, 0.1)[:2]), Options(windows=(5,)))
+def test_a_volume_in_words_has_the_sign_of_its_interval(value_m3: float, sigma_m3: float, words: str, change: Change):
     net = Volume(value_m3, sigma_m3, 0.0, 0.0, 400.0)
     assert words in sentences(replace(change, net=net))[0]
 
 
-def test_names_of_surveys_are_no_formulas(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    paths = pair(tmp_path, 0, 0.1)[:2]
-    change = measure(*(replace(open_surface(path), source="a$\\x$.tif") for path in paths), Options(windows=(5,)))
-    assert "<img" in figures.draw_section(change, 60, "a section")
+def test_names_of_surveys_are_no_formulas(change: Change):
+    one, other = (replace(survey, source="a$\\x$.tif") for survey in (change.earlier, change.later))
+    assert "<img" in figures.draw_section(replace(change, earlier=one, later=other), 60, "a section")
 
 
-def test_plants_of_a_page_lie_where_they_were_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_plants_of_a_page_lie_where_they_were_found(change: Change, monkeypatch: pytest.MonkeyPatch):
     drawn: list[Figure] = []
     monkeypatch.setattr(figures, "_SIDE", 100)
     monkeypatch.setattr(figures, "png", lambda figure, _: drawn.append(figure) or Markup(""))
-    change = measure(*(open_surface(path) for path in pair(tmp_path, 0, 0.10)[:2]))
     picture = np.full((300, 400, 3), 120, np.uint8)
     fine = Grid(change.grid.crs, WEST, NORTH, 0.1, 400, 300)
     cover = compare_cover(picture, picture, np.ones(fine.shape, bool), fine)

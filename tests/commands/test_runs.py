@@ -16,7 +16,7 @@ import opensplat_program
 import pytest
 import textured_wall as wall
 import torch
-from networks import SMALL
+from networks import PLAIN
 from rich.console import Console
 from scenes_on_disk import PINHOLE, survey, write_colmap
 
@@ -47,11 +47,6 @@ from tidefield.train.checkpoint import (
 from tidefield.train.loop import SceneTrainer
 
 QUIET = Console(quiet=True)
-PLAIN = replace(
-    SMALL,
-    network=replace(SMALL.network, without=(*SMALL.network.without, "matched surface", "doubled photographs")),
-)
-"""Nothing here is about surfaces, whose search takes most of the time of a small scene."""
 
 
 class Killed(BaseException):

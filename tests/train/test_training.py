@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 import textured_wall as wall
 import torch
-from networks import SMALL, SMALL_PAPER
+from networks import PLAIN, SMALL, SMALL_PAPER, network
 from rich.console import Console
 from safetensors import safe_open
 from safetensors.torch import save_file
@@ -72,21 +72,20 @@ def weights(trainer: SceneTrainer) -> dict[str, torch.Tensor]:
 
 
 def test_a_resumed_training_ends_bit_for_bit_where_an_unbroken_one_does(scene: Scene, tmp_path: Path) -> None:
-    budget = Budget(steps=6)
+    budget = Budget(steps=3)
     unbroken = SceneTrainer(SMALL, scene, seed=3, device=CPU)
-    for _ in range(6):
+    for _ in range(3):
         unbroken.step(budget)
     first = SceneTrainer(SMALL, scene, seed=3, device=CPU)
-    for _ in range(3):
+    for _ in range(2):
         first.step(budget)
     first.save(tmp_path)
     second = SceneTrainer(SMALL, scene, seed=99, device=CPU)
     second.resume(tmp_path)
-    for _ in range(3):
-        second.step(budget)
+    second.step(budget)
     for name, value in weights(unbroken).items():
         assert torch.equal(value, weights(second)[name]), name
-    assert second.progress.step == 6
+    assert second.progress.step == 3
     assert second.progress.losses == unbroken.progress.losses
 
 
@@ -94,8 +93,8 @@ def test_a_resumed_training_ends_bit_for_bit_where_an_unbroken_one_does(scene: S
 def test_encoders_whose_features_nothing_bounds_learn_more_slowly(
     bounded: bool, rate: float, encoder: float, scene: Scene
 ) -> None:
-    network = replace(SMALL.network, encoder=replace(SMALL.network.encoder, instance_norm=bounded))
-    config = replace(SMALL, network=network, train=replace(SMALL.train, learning_rate=rate))
+    network = replace(PLAIN.network, encoder=replace(PLAIN.network.encoder, instance_norm=bounded))
+    config = replace(PLAIN, network=network, train=replace(PLAIN.train, learning_rate=rate))
     trainer = SceneTrainer(config, scene, seed=3, device=CPU)
     trainer.step(Budget(steps=100))
     groups = trainer.optimizer.param_groups
@@ -103,7 +102,7 @@ def test_encoders_whose_features_nothing_bounds_learn_more_slowly(
     assert list(rates) == list(trainer.network.parameters()), "the order of checkpoints"
     for name, parameter in trainer.network.named_parameters():
         share = encoder if name.startswith("encoder.") else 1.0
-        assert rates[parameter] == pytest.approx(share * rate / SMALL.train.warm_up, rel=0.01), name
+        assert rates[parameter] == pytest.approx(share * rate / PLAIN.train.warm_up, rel=0.01), name
 
 
 @pytest.mark.thorough
@@ -319,20 +318,25 @@ def test_training_goes_on_from_the_shipped_weights(tmp_path: Path, monkeypatch: 
         moved("both", weights=tmp_path / "swift.safetensors", from_scratch=True)
 
 
-def test_training_lowers_the_loss_and_leaves_a_checkpoint(scene: Scene, tmp_path: Path) -> None:
-    trainer = SceneTrainer(SMALL, scene, seed=0, device=CPU)
-    assert train(trainer, tmp_path, Budget(steps=30), Console(quiet=True)) is None
+def test_training_lowers_the_loss_and_leaves_a_checkpoint(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trainer = SceneTrainer(replace(SMALL, train=replace(SMALL.train, warm_up=1)), scene, seed=0, device=CPU)
+    trainer.network.load_state_dict(network(SMALL.network, stir=0.02).state_dict())
+    batch = trainer.draw()
+    monkeypatch.setattr(trainer, "draw", lambda: batch)  # losses of different ones are not to be compared
+    assert train(trainer, tmp_path, Budget(steps=10), Console(quiet=True)) is None
     losses = trainer.progress.losses
-    assert sum(losses[-10:]) < sum(losses[:10])
+    assert losses[-1] < losses[0] / 2
     again = SceneTrainer(SMALL, scene, seed=1, device=CPU)
-    assert load_network(tmp_path, again.network).step == 30
+    assert load_network(tmp_path, again.network).step == 10
     assert all(torch.equal(v, weights(again)[n]) for n, v in weights(trainer).items())
 
 
 def test_no_batch_is_drawn_in_vain_without_a_gpu(scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn, draw = [], SceneTrainer.draw
     monkeypatch.setattr(SceneTrainer, "draw", lambda trainer: drawn.append(1) or draw(trainer))
-    assert train(SceneTrainer(SMALL, scene, seed=0, device=CPU), tmp_path, Budget(steps=3), Console(quiet=True)) is None
+    assert train(SceneTrainer(PLAIN, scene, seed=0, device=CPU), tmp_path, Budget(steps=3), Console(quiet=True)) is None
     assert len(drawn) == 3
 
 
@@ -360,7 +364,7 @@ def test_only_steps_count_as_time_of_training(scene: Scene, tmp_path: Path, monk
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_an_interruption_saves_before_it_stops(number: signal.Signals, scene: Scene, tmp_path: Path) -> None:
-    trainer = SceneTrainer(SMALL, scene, seed=0, device=CPU)
+    trainer = SceneTrainer(PLAIN, scene, seed=0, device=CPU)
     step = trainer.step
 
     def interrupted_step(budget: Budget) -> float:
@@ -371,7 +375,7 @@ def test_an_interruption_saves_before_it_stops(number: signal.Signals, scene: Sc
     trainer.step = interrupted_step  # type: ignore[method-assign]
     assert train(trainer, tmp_path, Budget(steps=50), Console(quiet=True)) == number
     assert 3 <= trainer.progress.step < 50
-    other = SceneTrainer(SMALL, scene, seed=1, device=CPU)
+    other = SceneTrainer(PLAIN, scene, seed=1, device=CPU)
     other.resume(tmp_path)
     assert other.progress.step == trainer.progress.step
     trainer.step = interrupted_step  # type: ignore[method-assign]
@@ -460,13 +464,13 @@ def test_a_checkpoint_of_another_network_is_refused(scene: Scene, tmp_path: Path
 
 
 def test_the_learning_rate_rises_in_a_line_and_falls_along_half_a_cosine(scene: Scene) -> None:
-    trainer = SceneTrainer(SMALL, scene, seed=0, device=CPU)
+    trainer = SceneTrainer(PLAIN, scene, seed=0, device=CPU)
     budget = Budget(steps=1000)
     rates = []
     for step in (0, 24, 49, 500, 999):
         trainer.progress.step = step
         trainer.step(budget)
-        rates.append(trainer.optimizer.param_groups[0]["lr"] / SMALL.train.learning_rate)
+        rates.append(trainer.optimizer.param_groups[0]["lr"] / PLAIN.train.learning_rate)
     expected = [warm * (0.02 + 0.98 * (1 + math.cos(math.pi * t)) / 2) for warm, t in WARM_AND_TIME]
     assert rates == pytest.approx(expected, rel=1e-6)
 
@@ -475,7 +479,7 @@ WARM_AND_TIME = [(0.02, 0.0), (0.5, 0.024), (1.0, 0.049), (1.0, 0.5), (1.0, 0.99
 
 
 def test_gradients_are_clipped_to_a_norm_of_one(scene: Scene) -> None:
-    trainer = SceneTrainer(SMALL, scene, seed=0, device=CPU)
+    trainer = SceneTrainer(PLAIN, scene, seed=0, device=CPU)
     loss = trainer.loss
 
     def hundredfold(inputs: Inputs) -> tuple[torch.Tensor, torch.Tensor]:
@@ -493,7 +497,7 @@ def test_what_is_not_finite_is_never_saved(
     at: str, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("tidefield.train.loop.SAVE_SECONDS", 0.0)
-    trainer = SceneTrainer(SMALL, scene, seed=0, device=CPU)
+    trainer = SceneTrainer(PLAIN, scene, seed=0, device=CPU)
     backward = trainer.backward
 
     def overflowing() -> torch.Tensor:
@@ -509,7 +513,7 @@ def test_what_is_not_finite_is_never_saved(
     trainer.backward = overflowing  # type: ignore[method-assign]
     with pytest.raises(FloatingPointError, match="at step 3; this is a defect of the program"):
         train(trainer, tmp_path, Budget(steps=3), Console(quiet=True))
-    again = SceneTrainer(SMALL, scene, seed=1, device=CPU)
+    again = SceneTrainer(PLAIN, scene, seed=1, device=CPU)
     assert load_network(tmp_path, again.network).step == 2
     assert all(value.isfinite().all() for value in weights(again).values())
 
