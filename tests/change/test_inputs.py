@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from markupsafe import Markup
 from surveys_of_two_dates import pair
 
 from tidefield import cli
@@ -77,7 +78,8 @@ def surfaces(tmp_path: Path, depth: float = 0.2) -> tuple[np.ndarray, np.ndarray
     return earlier, later, paths[2]
 
 
-def test_two_folders_of_maps_are_compared(tmp_path: Path):
+def test_two_folders_of_maps_are_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("tidefield.change.figures.png", lambda *_: Markup("<img>"))
     earlier, later, truth = surfaces(tmp_path)
     filled = np.where(np.isfinite(later), np.uint8(0), np.uint8(255))
     filled[100:120, 100:120] = 1

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from markupsafe import Markup
 from pyproj import CRS
 from scenes_on_disk import PINHOLE, write_colmap
 from scenes_on_disk import survey as posed_photographs
@@ -138,10 +139,10 @@ def test_the_report_is_one_page_with_the_volumes_and_the_pictures(compared: tupl
     assert str(out.parent) not in page  # of paths only their last names
 
 
-def test_clouds_are_compared_as_surfaces_and_by_m3c2(tmp_path: Path):
+def test_clouds_are_compared_as_surfaces_and_by_m3c2(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     import laspy
-    from pyproj import CRS
 
+    monkeypatch.setattr("tidefield.change.figures.png", lambda *_: Markup("<img>"))
     rng = np.random.default_rng(0)
     for name, lower in (("early", 0.0), ("late", 0.3)):
         xy = rng.uniform(0, 40, (30_000, 2))
@@ -209,11 +210,14 @@ def test_mistakes_are_told_in_one_message(
     assert not new.exists()
 
 
-def test_plants_and_water_are_told_where_orthophotos_and_levels_are_given(tmp_path: Path):
+def test_plants_and_water_are_told_where_orthophotos_and_levels_are_given(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     import pyogrio
     import rasterio
     from surveys_of_two_dates import write_surface
 
+    monkeypatch.setattr("tidefield.change.figures.png", lambda *_: Markup("<img>"))
     rng = np.random.default_rng(0)
     columns = np.arange(240)
     heights = np.broadcast_to(0.01 * columns, (160, 240))

@@ -1,6 +1,7 @@
 """Features kept in blocks: every tile finds what it shows, whatever is forgotten meanwhile."""
 
 import threading
+from dataclasses import replace
 
 import pytest
 import textured_wall as wall
@@ -29,6 +30,8 @@ from tidefield.parallel import read_ahead
 
 CPU = torch.device("cpu")
 TARGET = 3
+UNMATCHED = replace(SWIFT, network=replace(SWIFT.network, without=(*SWIFT.network.without, "matched surface")))
+"""Searching for the surface would take most of the time."""
 
 
 @pytest.fixture
@@ -113,7 +116,7 @@ def test_a_tile_reaches_from_its_nearest_to_its_farthest_surface(network: Networ
     prior = torch.tensor([1 / 5, 1 / 4, 1 / 6])[:, None, None].repeat(1, 24, 40)
     prior[0, 2, 9] = 1 / 4.5  # a cell of the second tile
     prior[0, 20:, 32:] = torch.nan
-    Renderer(network, at, SWIFT, CPU)(view, prior)
+    Renderer(network, at, UNMATCHED, CPU)(view, prior)
     [(middle, ends)] = given
     (uv, z), (at_middle, _) = view.project(ends.flatten(0, 1)), view.project(middle)
     torch.testing.assert_close(uv.reshape(15, 2, 2), at_middle.reshape(15, 1, 2).expand(-1, 2, -1), atol=1e-3, rtol=0)
@@ -125,7 +128,7 @@ def test_a_tile_reaches_from_its_nearest_to_its_farthest_surface(network: Networ
 @pytest.mark.usefixtures("small_blocks")
 def test_evicted_blocks_are_encoded_again_alike(network: Network):
     at = scene()
-    roomy, cramped = (Renderer(network, at, SWIFT, CPU) for _ in range(2))
+    roomy, cramped = (Renderer(network, at, UNMATCHED, CPU) for _ in range(2))
     cramped.cache = FeatureCache(network, at, CPU, budget_bytes=1)
     assert cramped.cache.slots == SWIFT.network.views + EXTRA_VIEWS < roomy.cache.slots
     one, other = (renderer(at.cameras[TARGET]) for renderer in (roomy, cramped))
@@ -138,7 +141,7 @@ def test_photographs_that_are_not_large_are_encoded_whole(network: Network, monk
     found = []
     for whole in (160, 159):
         monkeypatch.setattr(feature_cache, "WHOLE_PX", whole)
-        renderer = Renderer(network, at, SWIFT, CPU)
+        renderer = Renderer(network, at, UNMATCHED, CPU)
         found.append((renderer(at.cameras[TARGET]).colour, {block[2:] for block in renderer.cache._slots}))
     (colour, blocks), (in_blocks, several) = found
     assert blocks == {(0, 0)}
@@ -219,7 +222,7 @@ def test_maps_have_no_more_texels_than_are_counted_with_32_bits(network: Network
 @pytest.mark.usefixtures("small_blocks")
 def test_a_gpu_encodes_photographs_that_were_read_at_the_same_time(network: Network, monkeypatch: pytest.MonkeyPatch):
     at, readers = scene(), set[str]()
-    found = [Renderer(network, at, SWIFT, CPU)(at.cameras[TARGET]).colour]
+    found = [Renderer(network, at, UNMATCHED, CPU)(at.cameras[TARGET]).colour]
     read = FeatureCache._read
 
     def noted(self: FeatureCache, block: Block) -> BlockRead:
@@ -231,7 +234,7 @@ def test_a_gpu_encodes_photographs_that_were_read_at_the_same_time(network: Netw
     for device in ("cpu", "cuda"):
         monkeypatch.setattr(feature_cache, "read_ahead", lambda read, keys, _, on=device: read_ahead(read, keys, on))
         readers.clear()
-        found.append(Renderer(network, at, SWIFT, CPU)(at.cameras[TARGET]).colour)
+        found.append(Renderer(network, at, UNMATCHED, CPU)(at.cameras[TARGET]).colour)
         assert (threading.current_thread().name in readers) == (device == "cpu")
     assert torch.equal(found[0], found[1])
     assert torch.equal(found[0], found[2])
