@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 from pyproj import CRS, Transformer
 
-from tidefield.change.clouds import Cloud, compare_clouds, in_system, read_cloud, write_distances, write_surface
+from tidefield.change.clouds import (
+    Cloud,
+    compare_clouds,
+    default_cell,
+    in_system,
+    read_cloud,
+    write_distances,
+    write_surface,
+)
 from tidefield.change.inputs import open_pair
 from tidefield.change.registration import Registration
 from tidefield.change.surfaces import ChangeError, Grid, open_surface, other_datums
@@ -158,6 +166,12 @@ def test_the_surface_of_a_cloud_lies_where_its_points_do(tmp_path: Path):
         assert heights[file.index(0.5, 0.5)] == 2.0, "the mean of the two points in one cell"
         assert heights[file.index(3.5, 2.5)] == 7.0
     assert np.isfinite(heights).sum() == 2
+
+
+@pytest.mark.parametrize(("size_m", "count", "cell_m"), [(40, 12_000, 1.5), (30, 17_000, 0.75), (60, 4_000, 3.5)])
+def test_a_cell_has_ten_points_or_little_more(size_m: float, count: int, cell_m: float):
+    xyz = square(np.random.default_rng(0), float(size_m), count)
+    assert default_cell(Cloud(Path("a.laz"), None, xyz, None)) == pytest.approx(cell_m)
 
 
 def test_distances_of_clouds_in_feet_are_written_where_the_clouds_are(tmp_path: Path):

@@ -12,6 +12,7 @@ from tidefield.change.errors import (
     UNCORRELATED,
     Variogram,
     _joined,
+    _least_squares,
     anderson_terms,
     deviation95,
     fit_variogram,
@@ -53,6 +54,17 @@ def test_the_variogram_of_a_simulated_field_is_found():
     assert found.nugget == pytest.approx(0.36, abs=0.06)
     assert found.range_m == pytest.approx(10, rel=0.2)
     assert found.reached
+
+
+@pytest.mark.parametrize("ranges", [(1.2,), (1.2, 9.0), (2.0, 3.1), (1.5, 25.0), (6.0, 14.0)])
+def test_the_fit_finds_the_structures_that_semivariances_were_made_of(ranges: tuple[float, ...]):
+    lags = np.geomspace(0.7, 20, 18)
+    true = Variogram((0.5, 0.3)[: len(ranges)], ranges)
+    gammas = 0.01 * (1 - true.correlation(lags))
+    found, (nugget, *sills), left = _least_squares(lags, gammas, np.linspace(0.5, 1, 18), len(ranges))
+    assert found == pytest.approx(ranges, rel=1e-3)
+    assert [nugget, *sills] == pytest.approx([0.01 * true.nugget, *(0.01 * sill for sill in true.sills)], rel=1e-3)
+    assert left < 1e-12
 
 
 def test_white_noise_is_called_uncorrelated():

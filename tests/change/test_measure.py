@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import rasterio
 import shapely
-from surveys_of_two_dates import NORTH, WEST, pair, write_surface
+from surveys_of_two_dates import NORTH, WEST, noise, pair, write_surface
 
 from tidefield.change.errors import UNCORRELATED
 from tidefield.change.inputs import open_survey
@@ -52,6 +52,24 @@ def test_a_pit_and_a_heap_are_found_with_their_volumes(tmp_path: Path):
         low, high = volume.interval_m3
         assert low < true < high
         assert volume.value_m3 == pytest.approx(true, rel=0.1)
+
+
+@pytest.mark.parametrize(("cells", "cell_m"), [(38, 0.8), (27, 1.5)])
+def test_a_pit_across_a_survey_of_few_cells_leaves_stable_ground(cells: int, cell_m: float, tmp_path: Path):
+    """Margins of windows of 21 cells would leave none."""
+    rng = np.random.default_rng(5)
+    rows, columns = cell_m * (np.indices((cells, cells)) - cells / 2)
+    pit = -0.5 * (1 - (rows**2 + columns**2) / 36).clip(min=0)
+    heights = (noise(rng, pit.shape, 0.005, 0.002, 2) for _ in range(2))
+    earlier, later = (
+        write_surface(tmp_path / f"{k}.tif", (10 + 0.02 * columns + k * pit + z).astype(np.float32), cell_m)
+        for k, z in enumerate(heights)
+    )
+    found = measured(earlier, later)
+    low, high = found.cut.interval_m3
+    assert low < -pit.sum() * cell_m**2 < high
+    assert high - low < 15
+    assert found.false_alarms < 0.1
 
 
 @pytest.mark.thorough

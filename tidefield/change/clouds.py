@@ -198,7 +198,7 @@ def in_system(cloud: Cloud, crs: CRS | None) -> Cloud:
 
 
 def default_cell(cloud: Cloud) -> float:
-    """Side of cells that have ten points on average where there are points, to one significant digit."""
+    """Side of cells that have ten points on average where there are points, to half a unit of the first digit."""
     low, high = cloud.xyz[:, :2].min(axis=0), cloud.xyz[:, :2].max(axis=0)
     area = float(np.prod(np.maximum(high - low, 1e-3)))
     side = math.sqrt(_POINTS_PER_CELL * area / len(cloud.xyz))
@@ -206,8 +206,8 @@ def default_cell(cloud: Cloud) -> float:
         column, row = (np.floor((cloud.xyz[:, k] - low[k]) / side).astype(np.int64) for k in (0, 1))
         cells = np.unique(column + (row << 31))
         side = math.sqrt(_POINTS_PER_CELL * len(cells) * side**2 / len(cloud.xyz))
-    digit = 10.0 ** math.floor(math.log10(side))
-    return max(0.001, math.ceil(side / digit) * digit)
+    step = 10.0 ** math.floor(math.log10(side)) / 2
+    return max(0.001, math.ceil(side / step) * step)
 
 
 def write_surface(cloud: Cloud, cell_m: float, path: Path) -> None:

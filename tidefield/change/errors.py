@@ -16,12 +16,13 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import combinations
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64
 from numpy.fft import irfft2, rfft2
 from scipy.fft import next_fast_len
-from scipy.optimize import least_squares
+from scipy.optimize import least_squares, nnls
 from scipy.special import ndtr
 
 Z95 = 1.959963984540054
@@ -48,6 +49,8 @@ _SAME_RANGE = 1.01
 """Ranges whose ratio is smaller are one."""
 _WORTH = 6.0
 """A second structure is kept unless Akaike's criterion is higher by this: to miss a long correlation costs more."""
+_SEARCHED = 8
+"""Ranges, of whose combinations as many are refined: the best fits of a variogram may be narrow."""
 _CLIP = 4.0
 """Residuals are limited to this many deviations before they are squared: moved objects are no part of the noise."""
 _AT_ONCE = 1 << 20
@@ -326,16 +329,15 @@ def _fitted(lags: np.ndarray, gammas: np.ndarray, pairs: np.ndarray) -> Variogra
     # Bins at long distances have most pairs, but those at short ones decide: every bin counts alike once it has many.
     weight = np.sqrt(pairs / (pairs + pairs.max() * 1e-3))
     variance = float(np.median(gammas[len(gammas) // 2 :]))
-    best: tuple[float, np.ndarray] | None = None
+    best: tuple[float, np.ndarray, np.ndarray] | None = None
     for structures in (1, 2):
-        found = _least_squares(lags, gammas, weight, variance, structures)
-        cost = float((weight**2 * (_model(found, lags) - gammas) ** 2).sum())
-        criterion = len(lags) * math.log(cost + 1e-12 * variance**2) + 2 * len(found)  # Akaike
+        reaches, shares, left = _least_squares(lags, gammas, weight, structures)
+        criterion = len(lags) * math.log(left + 1e-12 * variance**2) + 2 * (len(reaches) + len(shares))  # Akaike
         if best is None or criterion < best[0] + _WORTH:
-            best = criterion, found
+            best = criterion, reaches, shares
     assert best is not None
-    nugget, *rest = best[1].tolist()
-    sills, ranges = _joined(rest[::2], rest[1::2])
+    nugget, *found = best[2].tolist()
+    sills, ranges = _joined(found, best[1].tolist())
     total = nugget + sum(sills)
     kept = [k for k in range(len(sills)) if sills[k] > _LEAST_SILL * total]
     return Variogram(
@@ -348,38 +350,35 @@ def _fitted(lags: np.ndarray, gammas: np.ndarray, pairs: np.ndarray) -> Variogra
     )
 
 
-def _model(parameters: np.ndarray, lags: np.ndarray) -> np.ndarray:
-    nugget, *rest = parameters
-    gamma = np.full(lags.shape, nugget)
-    for sill, reach in zip(rest[::2], rest[1::2], strict=True):
-        h = np.minimum(lags / reach, 1)
-        gamma += sill * (1.5 * h - 0.5 * h**3)
-    return gamma
-
-
 def _least_squares(
-    lags: np.ndarray, gammas: np.ndarray, weight: np.ndarray, variance: float, structures: int
-) -> np.ndarray:
-    """Nugget, then sill and range of each structure."""
-    best = None
-    spread = np.geomspace(lags[0] * 1.5, lags[-1], 5)
-    starts = [(one,) for one in spread] if structures == 1 else [(a, b) for a in spread for b in spread if a < b]
-    low = [0.0] + [0.0, lags[0]] * structures
-    high = [np.inf] + [np.inf, 2 * lags[-1]] * structures
-    for ranges in starts:
-        start = [0.3 * variance]
-        for reach in ranges:
-            start += [0.7 * variance / structures, reach]
-        found = least_squares(
-            lambda x: weight * (_model(x, lags) - gammas) / variance,
-            start,
-            bounds=(low, high),
-            x_scale=[variance] + [variance, lags[-1] / 4] * structures,
-        )
-        if best is None or found.cost < best.cost:
-            best = found
-    assert best is not None
-    return best.x
+    lags: np.ndarray, gammas: np.ndarray, weight: np.ndarray, structures: int
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Ranges of structures; the nugget and their sills; and the squares that are left.
+
+    With given ranges nugget and sills are a linear fit, so that ranges alone are searched (variable projection: Golub
+    and Pereyra 1973, doi 10.1137/0710036).
+    """
+    target = weight * gammas
+
+    def linear(ranges: Sequence[float] | np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        """Weighted semivariances of a nugget and of structures of sill 1; the best shares of them; what is left."""
+        h = np.minimum(lags[:, None] / np.asarray(ranges), 1)
+        columns = weight[:, None] * np.column_stack([np.ones(len(lags)), 1.5 * h - 0.5 * h**3])
+        shares, left = nnls(columns, target)
+        return columns, shares, left
+
+    def residuals(ranges: np.ndarray) -> np.ndarray:
+        columns, shares, _ = linear(ranges)
+        return (columns @ shares - target) / target.max()
+
+    low, high = float(lags[0]), float(2 * lags[-1])
+    starts = sorted(
+        combinations(np.geomspace(low, high, _SEARCHED).tolist(), structures), key=lambda ranges: linear(ranges)[2]
+    )
+    fits = [least_squares(residuals, start, bounds=(low, high), x_scale=start) for start in starts[:_SEARCHED]]
+    ranges = min(fits, key=lambda fit: fit.cost).x
+    _, shares, left = linear(ranges)
+    return ranges, shares, left**2
 
 
 def mean_correlation(variogram: Variogram, cells: int, cell_m: float) -> float:

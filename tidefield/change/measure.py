@@ -49,7 +49,8 @@ class Options:
         datum_error_m: one sigma of the error that all cells share, as the user knows it.
         shift_error_m: one sigma of the horizontal shift in each direction, as the user knows it; counts where the
             orthophotos do not tell the shift.
-        windows: cells along each side of the windows in which change is tested.
+        windows: cells along each side of the windows in which change is tested; those wider than half of the surveys'
+            shorter side are left out, but for the smallest.
     """
 
     cell_m: float | None = None
@@ -254,9 +255,10 @@ def measure(
     del unmoved
     rounding = math.hypot(*steps) / math.sqrt(12)  # each error is uniform within a step
     model: Model = "vertical" if options.register == "auto" else options.register
+    windows = tuple(window for window in options.windows if 2 * window <= min(grid.shape)) or (min(options.windows),)
     log.info("measuring errors" if given is not None else "finding stable ground, and measuring errors on it")
     registration, variogram, sigma, ground = settle(
-        dz, own, grid, given, model, options.windows, options.datum_error_m, rounding, remarks
+        dz, own, grid, given, model, windows, options.datum_error_m, rounding, remarks
     )
     slopes = None
     shift_error_m = shift.error_m if shift is not None and shift.known else options.shift_error_m
@@ -296,7 +298,7 @@ def measure(
             "change stands out; a shift of all ground cannot be told from a change of all ground"
         )
     log.info("outlining change, and what chance would have outlined")
-    outlines = find_outlines(dz, sigma, errors.near_sigma(), variogram, grid.cell_m, options.windows)
+    outlines = find_outlines(dz, sigma, errors.near_sigma(), variogram, grid.cell_m, windows)
     found = _summed(earlier, later, dz, errors, ground, shown, given is not None, outlines, alarms, polygons, remarks)
     partial = [f"{one.region.name} ({100 * one.compared:.0f}%)" for one in found.per_region if one.compared < _WHOLE]
     if partial:

@@ -115,8 +115,18 @@ def settle(
         moved = lowered(dz, coefficients, grid)
         outlines = find_outlines(moved, sigma, found.near(grid), variogram, grid.cell_m, windows)
         del moved
-        ground = guess & ~dilated(outlines.labels > 0, max(windows) // 2)
+        ground = _outside(guess, outlines.labels > 0, max(windows) // 2)
     raise AssertionError("the last turn returns")
+
+
+def _outside(
+    guess: Bool[np.ndarray, "rows columns"], changed: Bool[np.ndarray, "rows columns"], margin: int
+) -> Bool[np.ndarray, "rows columns"]:
+    """Ground off what changed by a margin of cells, or by less where a small survey would have hardly any left."""
+    least = min(_NMAD_CELLS, int(guess.sum()) // 3)
+    while (ground := guess & ~dilated(changed, margin)).sum() < least and margin > 0:
+        margin //= 2
+    return ground
 
 
 def _unchanged(

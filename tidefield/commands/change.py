@@ -76,7 +76,8 @@ class Change:
     cell: float | None = None
     """Side of the cells in metres; if not given, that of the coarser survey's pixels."""
     windows: tuple[int, ...] = (5, 11, 21)
-    """Cells along each side of the windows in which change is tested, odd numbers."""
+    """Cells along each side of the windows in which change is tested, odd numbers; those wider than half of the
+    surveys' shorter side are left out."""
     water: tuple[float, float] | None = None
     """Heights of the water at both dates, in the earlier survey's heights and their unit, for how far the waterline
     moved."""
