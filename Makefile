@@ -27,8 +27,9 @@ demo: $(VENV)/.installed
 	$(BIN)/tidefield demo $(OUT) $(ARGS)
 
 # Sharing these small tensor operations between threads costs more than it gains, many times more on busy cores.
+# Without bytecode on disk, every worker and child process would compile all modules again.
 test: $(VENV)/.installed-dev
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --maxprocesses 8 --dist loadfile $(ARGS)
+	PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --maxprocesses 8 --dist loadfile $(ARGS)
 
 bench: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks $(ARGS)
