@@ -375,7 +375,10 @@ def _least_squares(
     starts = sorted(
         combinations(np.geomspace(low, high, _SEARCHED).tolist(), structures), key=lambda ranges: linear(ranges)[2]
     )
-    fits = [least_squares(residuals, start, bounds=(low, high), x_scale=start) for start in starts[:_SEARCHED]]
+    fits = [
+        least_squares(residuals, start, bounds=(low, high), x_scale=start, method="dogbox", ftol=1e-4, xtol=1e-3)
+        for start in starts[:_SEARCHED]
+    ]
     ranges = min(fits, key=lambda fit: fit.cost).x
     _, shares, left = linear(ranges)
     return ranges, shares, left**2
