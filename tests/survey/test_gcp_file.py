@@ -77,6 +77,18 @@ def test_points_without_names_are_distinguished_by_position(tmp_path):
     assert [mark.point for mark in found.marks] == ["point 1", "point 2", "point 1"]
 
 
+@pytest.mark.parametrize("marked", [(" gcp1", " GCP1"), ("", " CHK1"), (" CHK1", "")])
+def test_a_surveyed_point_with_two_names_is_one_point(tmp_path, marked):
+    """Its twin would otherwise stay in the model while its accuracy is measured without it."""
+    lines = "".join(line(0, (1, 2 + k), f"DJI_000{k}.JPG{name}") for k, name in enumerate(marked))
+    found, remarks = control(survey_folder(tmp_path), UTM + "\n" + lines)
+    one = next(name for name in marked if name).strip()
+    assert found.points == {one: POINTS[0]}
+    assert [mark.point for mark in found.marks] == [one, one]
+    twice = ["gcp_list.txt: GCP1 has the coordinates of gcp1, and is taken for it."]
+    assert remarks == (twice if all(marked) else [])
+
+
 def test_names_with_spaces_are_those_of_photographs(tmp_path):
     for name in ("Watt Süd 1.jpg", "sub/Watt Süd 2.jpg", "Watt.jpg"):
         photograph(tmp_path / name)

@@ -22,6 +22,7 @@ from located_surveys import (
 from tidefield.errors import SurveyError
 from tidefield.survey.georeference.bundle_adjustment import reliable
 from tidefield.survey.georeference.georeference import georeference
+from tidefield.survey.georeference.ground_control import _MOST_PAIRS, Marks, triangulate_points
 from tidefield.survey.survey import Control, Survey
 
 
@@ -70,6 +71,27 @@ def bent():
     options.print_summary = options.refine_focal_length = options.refine_extra_params = False
     pycolmap.bundle_adjustment(model, options)
     return true, model, survey
+
+
+def test_a_point_with_many_marks_is_triangulated_from_those_that_agree():
+    """Not all pairs of them are tried; a third of the marks is wrong."""
+    model, rng = fly(lines=6, each=20).model, np.random.default_rng(0)
+    true = np.array([3.0, 2.0, 1.0])
+    seen = [(model.image(k), model.image(k).project_point(true)) for k in model.reg_image_ids()]
+    seen = [(image, uv) for image, uv in seen if uv is not None and (uv > 0).all() and (uv < (WIDTH, HEIGHT)).all()]
+    uv = np.array([uv for _, uv in seen]) + rng.normal(0, 0.3, (len(seen), 2))
+    uv[::3] += rng.uniform(30, 200, uv[::3].shape)
+    marks = Marks(
+        np.array(["A"] * len(seen)),
+        np.array([image.name for image, _ in seen]),
+        np.array([image.image_id for image, _ in seen]),
+        uv,
+        np.ones(len(seen)),
+        np.full(len(seen), float(WIDTH)),
+        np.tile(true, (len(seen), 1)),
+    )
+    assert len(seen) * (len(seen) - 1) / 2 > _MOST_PAIRS
+    np.testing.assert_allclose(triangulate_points(model, marks, 0.01)["A"], true, atol=0.03)
 
 
 @pytest.mark.parametrize("positions", [True, False])

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from camera_files import exif, photograph, texture
+from camera_files import exif, photograph, survey_folder, texture
 from PIL import Image, ImageOps
 from PIL.ExifTags import Base
 
@@ -15,7 +15,7 @@ from tidefield.data.readers.files import open_picture, quiet_pillow
 from tidefield.errors import SceneError, SurveyError
 from tidefield.survey.io import image_decoding
 from tidefield.survey.io.image_decoding import thumbnail, upright, upright_size, upright_uv
-from tidefield.survey.io.photographs import _Read, _read
+from tidefield.survey.io.photographs import _Read, _read, read_survey
 from tidefield.survey.survey import Photograph
 
 
@@ -86,10 +86,12 @@ def test_other_kinds_of_pixels_become_rgb(tmp_path, mode):
     np.testing.assert_array_equal(pixels, np.asarray(picture.convert("RGB")))
 
 
-def test_floating_point_pixels_are_refused(tmp_path):
+def test_a_survey_leaves_photographs_of_floating_point_numbers_out(tmp_path):
+    survey_folder(tmp_path)
     Image.fromarray(np.zeros((48, 64), np.float32)).save(tmp_path / "a.tif")
-    with pytest.raises(SurveyError, match="floating-point numbers; export it with 8 or 16 bits"):
-        upright(read(tmp_path / "a.tif"))
+    survey = read_survey(tmp_path)
+    assert "a.tif" not in [photograph.name for photograph in survey.photographs]
+    assert "a.tif has pixels of floating-point numbers: expected 8 or 16 bits; export it" in " ".join(survey.remarks)
 
 
 def test_a_thumbnail_is_the_photograph_reduced(tmp_path):

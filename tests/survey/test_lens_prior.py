@@ -136,6 +136,13 @@ def test_an_equivalent_focal_length_is_by_the_diagonal_of_the_whole_sensor(tmp_p
     assert focal(tmp_path / "e", (1280, 720), small) == pytest.approx(focal(tmp_path / "f", (1280, 960), small))
 
 
+@pytest.mark.parametrize(("size", "equivalent", "width_mm"), [((1164, 873), 36, 43.8), ((1200, 800), 36, 45.0)])
+def test_photographs_of_medium_formats_show_all_of_their_sensor(tmp_path, size, equivalent, width_mm):
+    """Fuji GFX (4:3), Leica S (3:2): of 45 mm and, by the diagonal, 36 mm for film."""
+    found = focal(tmp_path, size, {Base.FocalLength: 45.0, Base.FocalLengthIn35mmFilm: equivalent})
+    assert found == pytest.approx(45.0 / width_mm * size[0], rel=0.015)
+
+
 def test_the_sensor_of_a_camera_without_an_equivalent_is_looked_up(tmp_path):
     pytest.importorskip("lensfunpy", reason="lensfunpy is not installed (the extra [lensfun])")
     tags = {Base.Make: "Canon", Base.Model: "Canon EOS 5D Mark II", Base.FocalLength: 24.0}

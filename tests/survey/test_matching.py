@@ -26,11 +26,13 @@ from tidefield.survey.sfm.pairs import (
     EXHAUSTIVE,
     MAX_PAIRS,
     MIN_PAIRS,
+    MOST_AT_PLACE,
     NEIGHBOURS,
     PREVIEW,
     SEQUENTIAL,
     candidate_pairs,
     match_descriptors,
+    places_of,
     preview_descriptors,
     select_pairs,
 )
@@ -54,25 +56,81 @@ def apart_m(flight: list[Photograph]) -> dict[tuple[int, int], float]:
     return {(i, j): float(np.linalg.norm(position[i] - position[j])) for i, j in combinations(range(len(flight)), 2)}
 
 
+def pairs_of(flight: list[Photograph]) -> list[tuple[int, int]]:
+    return candidate_pairs(flight, places_of(flight))
+
+
 def test_few_photographs_are_all_paired():
     photographs = [unlocated_photograph(k, None) for k in range(EXHAUSTIVE)]
-    assert candidate_pairs(photographs) == list(combinations(range(EXHAUSTIVE), 2))
+    assert pairs_of(photographs) == list(combinations(range(EXHAUSTIVE), 2))
 
 
 def test_number_of_candidates_is_linear_with_positions():
     small, large = lawnmower(8, 10), lawnmower(20, 100)
-    assert len(candidate_pairs(large)) < 1.3 * len(candidate_pairs(small)) * len(large) / len(small)
-    assert len(candidate_pairs(large)) <= len(large) * (NEIGHBOURS + SEQUENTIAL)
+    assert len(pairs_of(large)) < 1.3 * len(pairs_of(small)) * len(large) / len(small)
+    assert len(pairs_of(large)) <= len(large) * (NEIGHBOURS + SEQUENTIAL)
 
 
 def test_near_photographs_are_paired_and_far_ones_are_not():
     flight = lawnmower(20, 20)
-    pairs = set(candidate_pairs(flight))
+    pairs = set(pairs_of(flight))
     for (i, j), apart in apart_m(flight).items():
         if apart < 45:
             assert (i, j) in pairs
         if apart > 200 and j - i > SEQUENTIAL:
             assert (i, j) not in pairs
+
+
+def rig(cameras: int) -> list[Photograph]:
+    """Photographs of several cameras, whose positions are some decimetres apart, at each station of a flight."""
+    rng, flight = np.random.default_rng(0), []
+    for station in lawnmower(8, 12):
+        assert station.position is not None
+        for camera in range(cameras):
+            east, north = rng.normal(0, 0.3, 2).tolist()
+            position = replace(
+                station.position,
+                latitude_deg=station.position.latitude_deg + north / 111_000,
+                longitude_deg=station.position.longitude_deg + east / 65_000,
+            )
+            flight.append(replace(station, name=f"{camera}/{station.name}", camera=str(camera), position=position))
+    return flight
+
+
+def test_photographs_of_cameras_that_fly_together_are_paired_across_flight_lines():
+    flight = rig(5)
+    pairs = pairs_of(flight)
+    lines = {frozenset((i, j // 60)) for a, b in pairs for i, j in ((a, b), (b, a)) if i // 60 != j // 60}
+    for k, line in ((k, k // 60) for k in range(len(flight))):
+        beyond = {line - 1, line + 1} & set(range(8))
+        assert {frozenset((k, other)) for other in beyond} <= lines
+    assert len(pairs) < len(flight) * 5 * (NEIGHBOURS + 1)
+
+
+def test_usual_flights_have_a_place_for_each_photograph():
+    flight = lawnmower(8, 10)
+    assert places_of(flight) == list(range(80))
+
+
+def test_photographs_of_one_place_do_not_take_all_pairs():
+    """Of eleven photographs at two places two of each, the best, are paired with another; of unlike places all are."""
+    matches = {(0, k): 20 - k for k in range(1, 12)}
+    table = torch.zeros(12, PREVIEW, 128)
+    for (_, k), count in matches.items():
+        table[0, :20, :20] = table[k, :count, :20] = 0
+        table[0, torch.arange(20), torch.arange(20)] = 1
+        table[k, torch.arange(count), torch.arange(count)] = 1
+    kept = {
+        where: select_pairs(list(matches), table, places, lambda done, whole: None)
+        for where, places in (("two", [0, *[1] * 6, *[2] * 5]), ("own", range(12)))
+    }
+    assert [pair for pair in kept["two"] if pair[1] in (1, 2, 7, 8)] == [(0, 1), (0, 2), (0, 7), (0, 8)]
+    assert kept["own"] == sorted(matches)
+
+
+def test_a_drone_that_hovers_is_not_paired_with_itself_all_the_time():
+    flight = [replace(one, position=lawnmower(1, 1)[0].position) for one in lawnmower(20, 10)]
+    assert len(pairs_of(flight)) <= len(flight) * (NEIGHBOURS + 1) * MOST_AT_PLACE / 2
 
 
 def test_near_photographs_on_both_sides_of_the_date_line_are_paired():
@@ -83,7 +141,7 @@ def test_near_photographs_on_both_sides_of_the_date_line_are_paired():
         if p.position
     ]
     assert len({p.position.longitude_deg > 0 for p in flight if p.position}) == 2
-    assert {pair for pair, apart in apart_m(there).items() if apart < 45} <= set(candidate_pairs(flight))
+    assert {pair for pair, apart in apart_m(there).items() if apart < 45} <= set(pairs_of(flight))
 
 
 def test_fields_far_apart_are_not_paired():
@@ -94,7 +152,7 @@ def test_fields_far_apart_are_not_paired():
     also = [
         replace(p, time_s=p.time_s + 2e6, position=replace(p.position, latitude_deg=56.0)) for p in here if p.position
     ]
-    pairs = candidate_pairs([*here, *there, *also])
+    pairs = pairs_of([*here, *there, *also])
     assert not [pair for pair in pairs if pair[0] // 20 != pair[1] // 20]
     assert len([pair for pair in pairs if pair[1] < 20]) > 100
 
@@ -102,7 +160,7 @@ def test_fields_far_apart_are_not_paired():
 def test_a_photograph_without_position_is_paired_with_all():
     flight = lawnmower(10, 10)
     flight[37] = replace(flight[37], position=None)
-    pairs = set(candidate_pairs(flight))
+    pairs = set(pairs_of(flight))
     assert all((min(37, k), max(37, k)) in pairs for k in range(100) if k != 37)
 
 
@@ -110,16 +168,16 @@ def test_consecutive_photographs_are_paired_whatever_their_positions():
     flight = lawnmower(10, 10)
     assert flight[50].position is not None
     flight[50] = replace(flight[50], position=replace(flight[50].position, latitude_deg=-10.0))
-    pairs = set(candidate_pairs(flight))
+    pairs = set(pairs_of(flight))
     assert {(49, 50), (50, 51), (48, 50), (50, 52)} <= pairs
 
 
 def test_a_long_pause_ends_the_sequence():
     field = [unlocated_photograph(k, 54 + 20 * k / 111_000) for k in range(30)]
     later = [unlocated_photograph(30 + k, 54.5 + 20 * k / 111_000, time_s=3600.0 + k) for k in range(30)]
-    assert not [pair for pair in candidate_pairs([*field, *later]) if pair[0] < 30 <= pair[1]]
+    assert not [pair for pair in pairs_of([*field, *later]) if pair[0] < 30 <= pair[1]]
     timeless = [replace(one, time_s=float("nan")) for one in (*field, *later)]
-    assert {(28, 30), (29, 30), (29, 31)} <= set(candidate_pairs(timeless))
+    assert {(28, 30), (29, 30), (29, 31)} <= set(pairs_of(timeless))
 
 
 def test_photographs_without_a_time_leave_the_order_of_the_others_as_it_is():
@@ -132,18 +190,18 @@ def test_photographs_without_a_time_leave_the_order_of_the_others_as_it_is():
         assert own is not None
         flight[k] = replace(flight[k], position=replace(own, latitude_deg=-10.0 - k))
     timed = range(1, 100, 2)
-    assert {*pairwise(timed), *zip(timed, timed[2:], strict=False)} <= set(candidate_pairs(flight))
+    assert {*pairwise(timed), *zip(timed, timed[2:], strict=False)} <= set(pairs_of(flight))
 
 
 def test_candidates_of_many_photographs_without_positions_take_little_memory():
     count = 200
     pairs = list(combinations(range(count), 2))
     tracemalloc.start()
-    assert candidate_pairs([unlocated_photograph(k, None) for k in range(count)]) == pairs
+    assert pairs_of([unlocated_photograph(k, None) for k in range(count)]) == pairs
     chosen_from = tracemalloc.get_traced_memory()[1]
     tracemalloc.reset_peak()
     before = tracemalloc.get_traced_memory()[0]
-    kept = select_pairs(pairs, torch.ones(count, 1, 1), lambda done, whole: None)
+    kept = select_pairs(pairs, torch.ones(count, 1, 1), range(count), lambda done, whole: None)
     selected_from = tracemalloc.get_traced_memory()[1] - before
     tracemalloc.stop()
     assert len(kept) < len(pairs) / 10
@@ -161,7 +219,7 @@ def test_the_best_pairs_of_each_photograph_are_selected_the_first_among_equals()
     for k in range(count):
         ranked = sorted((pair for pair in matches if k in pair), key=lambda pair: (-matches[pair], pair))
         expected |= set(ranked[:MIN_PAIRS])
-    assert select_pairs(list(matches), table, lambda done, whole: None) == sorted(expected)
+    assert select_pairs(list(matches), table, range(len(table)), lambda done, whole: None) == sorted(expected)
 
 
 def test_pairs_whose_largest_features_match_are_selected_with_the_best_of_each_photograph():
@@ -169,7 +227,7 @@ def test_pairs_whose_largest_features_match_are_selected_with_the_best_of_each_p
     # Photograph k shares half of its features with k + 1.
     ground = rng.integers(0, 255, (count + 1, PREVIEW // 2, 128)).astype(np.uint8)
     table = preview_descriptors([np.concatenate([ground[k], ground[k + 1]]) for k in range(count)])
-    kept = select_pairs(list(combinations(range(count), 2)), table, lambda done, whole: None)
+    kept = select_pairs(list(combinations(range(count), 2)), table, range(count), lambda done, whole: None)
     assert {(k, k + 1) for k in range(count - 1)} <= set(kept)
     assert len(kept) <= count * MAX_PAIRS / 2
     partners = [sum(k in pair for pair in kept) for k in range(count)]
@@ -181,7 +239,7 @@ def test_previews_are_padded_with_zeros():
     assert table.shape == (2, PREVIEW, 128)
     assert table[0, :3].norm(dim=1).allclose(table.new_ones(3))
     assert (table[0, 3:] == 0).all()
-    assert select_pairs([(0, 1)], table, lambda done, whole: None) == [(0, 1)]
+    assert select_pairs([(0, 1)], table, range(2), lambda done, whole: None) == [(0, 1)]
 
 
 def unit(count: int, seed: int) -> Tensor:

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from camera_files import BRIGHTON, exif, photograph, real_survey, survey_folder, texture, xmp
+from located_surveys import unlocated_photograph
 from PIL import Image
 
 from tidefield.errors import SurveyError
@@ -22,7 +23,7 @@ from tidefield.survey.quality.assessment import (
     select_photographs,
 )
 from tidefield.survey.quality.measures import Measures, sharpness
-from tidefield.survey.survey import Control, Mark, Survey
+from tidefield.survey.survey import Control, Mark, Photograph, Survey
 
 SIZE = (400, 300)
 GROUND = texture((1800, 900), seed=7)
@@ -252,6 +253,35 @@ def test_photographs_away_from_the_survey_are_found(tmp_path):
     assert sorted(found) == ["away.jpg", "low.jpg"]
     assert found["away.jpg"].startswith("off the survey: it was taken 76")
     assert "2 m above the take-off point, the others at 40 m" in found["low.jpg"]
+
+
+def stations(lines: list[int], along_m: float, across_m: float, cameras: int = 1) -> list[Photograph]:
+    """As many photographs along each line, of each camera."""
+    places = [(line, k) for line, count in enumerate(lines) for k in range(count) for _ in range(cameras)]
+    return [
+        unlocated_photograph(number, line * across_m / 111_195, k * along_m / 111_195)
+        for number, (line, k) in enumerate(places)
+    ]
+
+
+@pytest.mark.parametrize(("cameras", "along_m", "across_m"), [(1, 5, 35), (5, 14, 31)])
+def test_a_short_outer_flight_line_is_part_of_a_survey_of_unknown_height(cameras: int, along_m: int, across_m: int):
+    assert find_beyond_gap(stations([40] * 5 + [2], along_m, across_m, cameras)) == {}
+
+
+def test_how_far_a_photograph_lies_off_the_survey_is_measured_to_all_that_stay():
+    far = stations([50, 0, 40, 0, 0, 1], 5, 150)
+    assert list(find_beyond_gap(far)) == [90]
+    assert "taken 450 m from the nearest of the others; 100 m is the limit" in find_beyond_gap(far)[90]
+
+
+def test_values_that_fill_a_small_part_of_16_bits_are_to_be_stretched(tmp_path):
+    for index in range(4):
+        levels = 7000 + 3 * view(130 * index)[..., 0].astype(np.uint16)
+        Image.fromarray(levels).save(tmp_path / f"{index}.tif")
+    survey = read_survey(tmp_path)
+    with pytest.raises(SurveyError, match="--keep-all; where values of 16 bits fill a small part of their range, str"):
+        select_photographs(survey, assess_quality(survey))
 
 
 def test_a_second_field_and_a_low_flight_are_parts_of_the_survey(tmp_path):

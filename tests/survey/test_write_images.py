@@ -200,7 +200,7 @@ def test_transparent_photographs_are_written_opaque_and_what_is_transparent_is_m
     assert [photograph.has_alpha for photograph in photographs] == [False, True, True]
     photographs = (*photographs[:1], replace(photographs[1], mask=tmp_path / f"1.{suffix}.png"), photographs[2])
     write_images(photographs, tmp_path / "images", None, LENSES, quiet)
-    write_masks(photographs, tmp_path / "masks")
+    write_masks(photographs, tmp_path / "masks", quiet)
     for k, photograph in enumerate(photographs):
         assert not read_header(tmp_path / "images" / photograph.name)[2]
         np.testing.assert_array_equal(decode(tmp_path / "images" / photograph.name), upright(photograph))

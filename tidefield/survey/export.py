@@ -223,13 +223,18 @@ def write_reduced_images(scene: Path, names: Sequence[str], factors: Sequence[in
             progress(done, len(names))
 
 
-def write_masks(photographs: Sequence[Photograph], folder: Path) -> None:
+def write_masks(photographs: Sequence[Photograph], folder: Path, progress: Progress) -> None:
     """Write the masks of photographs into a folder as NAME.png, a white one for photographs without.
 
     nerfstudio reads masks of all photographs or of none.
     """
-    for photograph in photographs:
+
+    def write(photograph: Photograph) -> None:
         write_mask(folder / f"{photograph.name}.png", used_pixels(photograph))
+
+    with quiet_pillow(), ThreadPoolExecutor(cores()) as pool:
+        for done, _ in enumerate(pool.map(write, photographs), start=1):
+            progress(done, len(photographs))
 
 
 def tangent_map(camera: pycolmap.Camera) -> Float32[np.ndarray, "H W"]:

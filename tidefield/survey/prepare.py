@@ -43,7 +43,7 @@ from tidefield.survey.sfm.mapping import (
 )
 from tidefield.survey.sfm.matching import match
 from tidefield.survey.sfm.model_files import model_files, read_model, write_model
-from tidefield.survey.sfm.pairs import PREVIEW, candidate_pairs, preview_descriptors, select_pairs
+from tidefield.survey.sfm.pairs import PREVIEW, candidate_pairs, places_of, preview_descriptors, select_pairs
 from tidefield.survey.sfm.placing import MIN_INLIERS, place
 from tidefield.survey.stages import Facts, Stages
 from tidefield.survey.survey import Photograph, Survey
@@ -280,9 +280,10 @@ def choose_pairs(
 ) -> Facts:
     """Choose the pairs of photographs to match, by name.
 
-    Pairs with a held-out photograph do not compete with the others, and there are none of two.
+    Pairs with a held-out photograph are selected apart from the others, and there are none of two.
     """
-    candidates = candidate_pairs(photographs)
+    places = places_of(photographs)
+    candidates = candidate_pairs(photographs, places)
     of_held_out = [sum(photographs[k].name in held_out for k in pair) for pair in candidates]
     parts = [[pair for pair, n in zip(candidates, of_held_out, strict=True) if n == part] for part in (0, 1)]
     with pycolmap.Database.open(database) as db:
@@ -290,7 +291,7 @@ def choose_pairs(
         largest = [np.array(db.read_descriptors(ids[p.name]).data[:PREVIEW]) for p in photographs]
     with ProgressBar(console, "Choosing pairs") as bar:
         previews = preview_descriptors(largest)
-        pairs = [pair for part in parts for pair in select_pairs(part, previews, bar)]
+        pairs = [pair for part in parts for pair in select_pairs(part, previews, places, bar)]
     return {"pairs": [[photographs[i].name, photographs[j].name] for i, j in pairs]}
 
 
@@ -398,7 +399,8 @@ def write_scene(
         write_images(photographs, images, None, cameras, bar)
     masks = _have_masks(photographs)
     if masks:
-        write_masks(photographs, scene / "masks")
+        with ProgressBar(console, "Writing masks") as bar:
+            write_masks(photographs, scene / "masks", bar)
     correction = None
     if colour != "off":
         # A cache of its own: photographs that are to be corrected would only fill the user's.

@@ -39,6 +39,8 @@ GROSS_ERROR = 0.02
 """Of the image width: a mark with this reprojection error in an unadjusted model, which bends by less, is wrong."""
 _CONTROL_M = 0.02
 """Standard deviation of a surveyed point, as its weight relative to the cameras' positions."""
+_MOST_PAIRS = 200
+"""Of marks of one point that it is triangulated from, at random of more: of 200 one fits while a tenth of marks do."""
 _REPEATS = 4
 """Weight of a mark. A matched point is as precise as a mark, but its errors are correlated with its neighbours' (lens,
 shutter), which the sum of squares ignores; the weight compensates for that."""
@@ -184,16 +186,10 @@ def reprojection_px(
 
 def triangulate(model: pycolmap.Reconstruction, marks: Marks) -> Float64[np.ndarray, " 3"] | None:
     """Triangulate two or more marks of one point by least reprojection error; None if in front of no camera."""
-    images = [model.image(int(number)) for number in marks.image]
-    lenses = [model.camera(image.camera_id) for image in images]
-    normalised = [lens.cam_from_img(uv) for lens, uv in zip(lenses, marks.uv_px, strict=True)]
-    rays = np.array([np.append(xy, 1.0) for xy in normalised if xy is not None])
-    if len(rays) < len(images):  # a mark where the lens images nothing
-        return None
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    start = _triangulate_linearly(np.array([image.cam_from_world().matrix() for image in images]), rays)
+    start = _triangulate_linearly(*_rays(model, marks))
     if not np.isfinite(start).all():
         return None
+    images = [model.image(int(number)) for number in marks.image]
 
     def error(point: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, " K"]:
         projected = [image.project_point(point) for image in images]
@@ -203,10 +199,27 @@ def triangulate(model: pycolmap.Reconstruction, marks: Marks) -> Float64[np.ndar
     return least_squares(error, start, x_scale=np.maximum(np.abs(start), 1e-3)).x
 
 
+def _rays(
+    model: pycolmap.Reconstruction, marks: Marks
+) -> tuple[Float64[np.ndarray, "K 3 4"], Float64[np.ndarray, "K 3"]]:
+    """Poses of the photographs of marks (T_camera_world) and unit rays to these; NaN where the lens images nothing."""
+    images = [model.image(int(number)) for number in marks.image]
+    normalised = [model.camera(image.camera_id).cam_from_img(uv) for image, uv in zip(images, marks.uv_px, strict=True)]
+    rays = np.array([np.full(3, np.nan) if xy is None else np.append(xy, 1.0) for xy in normalised])
+    poses = np.array([image.cam_from_world().matrix() for image in images])
+    return poses, rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+
 def _triangulate_linearly(
     T_camera_world: Float64[np.ndarray, "K 3 4"], rays_camera: Float64[np.ndarray, "K 3"]
 ) -> Float64[np.ndarray, " 3"]:
-    """Triangulate unit rays by the smallest algebraic distance; pycolmap 4.0 has no such function."""
+    """Triangulate unit rays by the smallest algebraic distance; pycolmap 4.0 has no such function.
+
+    Returns:
+        The point; not finite where rays are parallel or unknown.
+    """
+    if not np.isfinite(rays_camera).all():
+        return np.full(3, np.nan)
     across = T_camera_world - rays_camera[:, :, None] * np.einsum("ki,kij->kj", rays_camera, T_camera_world)[:, None]
     _, vectors = np.linalg.eigh(np.einsum("kij,kil->jl", across, across))
     with np.errstate(divide="ignore", invalid="ignore"):  # parallel rays meet at infinity
@@ -216,7 +229,7 @@ def _triangulate_linearly(
 def triangulate_points(
     model: pycolmap.Reconstruction, marks: Marks, tolerance: float
 ) -> dict[str, Float64[np.ndarray, " 3"]]:
-    """Triangulate each point from the largest set of at least two marks that agree.
+    """Triangulate each point from the largest set of at least two marks that agree with a pair of them.
 
     Args:
         tolerance: largest reprojection error, in image widths.
@@ -224,10 +237,14 @@ def triangulate_points(
     found = {}
     for name in marks.points:
         own = marks.where(marks.of(name))
+        poses, rays = _rays(model, own)
+        pairs = np.array(list(combinations(range(len(own)), 2)), dtype=int).reshape(-1, 2)
+        if len(pairs) > _MOST_PAIRS:
+            pairs = np.random.default_rng(0).permutation(pairs)[:_MOST_PAIRS]
         best, most = None, (0, 0.0)
-        for pair in combinations(range(len(own)), 2):
-            point = triangulate(model, own.where(np.isin(np.arange(len(own)), pair)))
-            if point is None:
+        for pair in pairs:
+            point = _triangulate_linearly(poses[pair], rays[pair])
+            if not np.isfinite(point).all():
                 continue
             share = reprojection_px(model, own, np.tile(point, (len(own), 1))) / own.width_px / tolerance
             rank = (int((share < 1).sum()), -float(np.minimum(share, 1).sum()))

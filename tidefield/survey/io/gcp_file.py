@@ -61,23 +61,36 @@ def read_control(path: Path, photographs: Sequence[Photograph]) -> tuple[Control
     by_name = {photograph.name: photograph for photograph in photographs}
     names = PhotographNames(by_name)
     first_lines: dict[str, tuple[str, tuple[float, ...]]] = {}
-    unnamed: dict[tuple[float, ...], str] = {}
+    unnamed = 0
     points: dict[str, tuple[float, float, float]] = {}
     marks: dict[tuple[str, str], Mark] = {}
     found, missing, outside = 0, {}, []
+    entries = []
     for where, line in lines:
-        (x, y, z, u, v), rest = _parse_line(where, line)
+        numbers, rest = _parse_line(where, line)
         name, words = names.split(rest)
         if name is None:
             image, words = split_unknown(rest)
             missing[image] = None
-        point = words[0].strip() if words else unnamed.setdefault((x, y, z), f"point {len(unnamed) + 1}")
+        entries.append((where, numbers, name, words[0].strip() if words else None))
+    # One surveyed point under two names would be its own check.
+    of_place: dict[tuple[float, ...], str] = {}
+    for _, (*xyz, _, _), _, point in entries:
+        if point is not None:
+            of_place.setdefault(tuple(xyz), point)
+    same: dict[str, str] = {}
+    for where, (x, y, z, u, v), name, point in entries:
+        if point is None and (x, y, z) not in of_place:
+            unnamed += 1
+        point = point or of_place.setdefault((x, y, z), f"point {unnamed}")
         first_where, first = first_lines.setdefault(point, (where, (x, y, z)))
         if (np.abs(np.subtract(first, (x, y, z))) > (across, across, _SAME_POINT_M)).any():
             raise SurveyError(
                 f"{where} puts the point {point} at {(x, y, z)}, {first_where.rpartition(', ')[2]} at {first}: "
                 "expected one position per point; correct one, or give them different names"
             )
+        if (first_name := of_place[x, y, z]) != point:
+            same[point], point = first_name, first_name
         if name is None:
             continue
         found += 1
@@ -119,6 +132,9 @@ def read_control(path: Path, photographs: Sequence[Photograph]) -> tuple[Control
             f"{system.name}: expected coordinates of this system, easting or longitude first; correct them"
         )
     remarks = unit_remarks(path, system)
+    remarks += [
+        f"{path.name}: {one} has the coordinates of {other}, and is taken for it." for one, other in same.items()
+    ]
     if missing:
         remarks.append(
             f"{path.name} marks points in photographs that are not among the survey's (left out): "

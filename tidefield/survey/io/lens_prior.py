@@ -23,6 +23,8 @@ _FILM_DIAGONAL_MM = math.hypot(36, 24)
 # Aspect ratio of sensors by the upper limit of their crop factor: full frame and APS-C 3:2, Four Thirds 4:3,
 # one inch 3:2, smaller ones 4:3 (https://en.wikipedia.org/wiki/Image_sensor_format).
 _SHAPES = ((1.75, 3 / 2), (2.4, 4 / 3), (3.2, 3 / 2), (math.inf, 4 / 3))
+_MEDIUM_FORMAT = 0.9
+"""Crop factor below which sensors are of either shape, and photographs are taken to show all of them."""
 
 # Width in mm of 4:3 sensors whose 35 mm equivalent is rounded so coarsely that it is 2% off; from OpenSfM's
 # opensfm/data/sensor_data.json (BSD-2-Clause).
@@ -186,7 +188,7 @@ def _crop_factor(make: str, model: str) -> float:
 def _equivalent_px(equivalent_mm: float, crop: float, width: int, height: int) -> float:
     """The focal length of which the equivalent for 35 mm film is known, for the diagonal of the whole sensor."""
     columns, rows = width, height
-    if 0 < crop < math.inf:
+    if _MEDIUM_FORMAT < crop < math.inf:
         columns, rows = _uncropped_px(width, height, next(shape for limit, shape in _SHAPES if crop < limit))
     return equivalent_mm / _FILM_DIAGONAL_MM * math.hypot(columns, rows)
 

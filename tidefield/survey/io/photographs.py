@@ -439,6 +439,8 @@ def _read(path: Path, name: str, mask: Path | None = None) -> _Read | str:
             metadata = read_metadata(image)
             stored, transparent = stored_size(image), has_alpha(image)
             refuse_truncated(path, image)
+            if image.mode == "F":
+                return f"{path} has pixels of floating-point numbers: expected 8 or 16 bits; export it with these"
     except SurveyError as error:
         return str(error)
     width, height = upright_size(*stored, metadata.orientation)

@@ -60,7 +60,9 @@ FEW_LOW = 0.1
 """A larger share of low photographs is a part of the survey."""
 
 _MIN_GAP_M = 20.0  # positions of a hovering drone scatter
+_GAP_OF_UNKNOWN_HEIGHT_M = 100.0  # neighbours may be of one flight line, or of cameras that fly together
 _CELLS_IN_GAP = 8.0
+_MAY_BE_DEEP = (".png", ".tif", ".tiff")  # 12 bits of a sensor, or temperatures, in 16
 _UNKNOWN_FOCAL = 0.75  # of the longer side
 
 MAX_SHIFT = 0.03
@@ -145,6 +147,9 @@ def select_photographs(survey: Survey, decisions: Sequence[QualityDecision], kee
         kinds = Counter((decision.left_out or "").partition(":")[0] for decision in out)
         counted = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
         hint = "" if keep_all else ", or keep them all the same with --keep-all"
+        dark = {decision.name for decision in out if (decision.left_out or "").startswith(("flat", "under-exposed"))}
+        if any(one.name in dark and one.path.suffix.casefold() in _MAY_BE_DEEP for one in survey.photographs):
+            hint += "; where values of 16 bits fill a small part of their range, stretch those of all files alike"
         raise SurveyError(
             f"{len(selected.photographs)} of the {len(survey.photographs)} photographs in {survey.folder} can be used "
             f"({counted}; such as {out[0].name}, {out[0].left_out}): expected at least {FEWEST}; take them again{hint}"
@@ -286,7 +291,9 @@ def find_beyond_gap(photographs: Sequence[Photograph]) -> dict[int, str]:
         return {}
     nearest_m = float(np.median(KDTree(xy_m).query(xy_m, 2)[0][:, 1]))
     height_m = _flight_height_m(photographs)
-    gap_m = max(_MIN_GAP_M, GAP_SPACINGS * nearest_m, GAP_HEIGHTS * height_m if height_m > 0 else 0.0)
+    gap_m = max(
+        _MIN_GAP_M, GAP_SPACINGS * nearest_m, GAP_HEIGHTS * height_m if height_m > 0 else _GAP_OF_UNKNOWN_HEIGHT_M
+    )
     # Single linkage with distances shorter than a gap. Positions are rounded to an eighth of the gap first, because
     # thousands at one position would be millions of pairs.
     cells, cell_of = np.unique(np.round(xy_m * (_CELLS_IN_GAP / gap_m)), axis=0, return_inverse=True)
@@ -299,7 +306,7 @@ def find_beyond_gap(photographs: Sequence[Photograph]) -> dict[int, str]:
     small[largest] = False
     if sizes[small].sum() > max(1.0, FEW_IN_ALL * len(located)):
         return {}
-    away_m, _ = KDTree(xy_m[cluster == largest]).query(xy_m)
+    away_m, _ = KDTree(xy_m[~small[cluster]]).query(xy_m)
     return {
         located[row]: f"off the survey: it was taken {away_m[row]:.0f} m from the nearest of the others; {gap_m:.0f} m "
         "is the limit."
