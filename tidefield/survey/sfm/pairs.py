@@ -93,7 +93,7 @@ def candidate_pairs(photographs: Sequence[Photograph], places: Sequence[int]) ->
         there = list(at_place.values())
         xy_m = positions_m(photographs)[list(at_place)]
         most = min(NEIGHBOURS, len(there) - 1)
-        distances, nearest = KDTree(xy_m).query(xy_m, k=range(1, most + 2))
+        distances, nearest = (np.reshape(of, (len(there), -1)) for of in KDTree(xy_m).query(xy_m, k=most + 1))
         # A field with fewer photographs than that has its next neighbours in another field, far away.
         limit = MAX_RELATIVE_DISTANCE * np.median(distances[:, min(NEIGHBOURS // 2, most)])
         for i, j in zip(*np.nonzero(distances <= limit), strict=True):
