@@ -75,6 +75,7 @@ def test_a_run_is_opened_with_its_scene_and_renders_as_it_was_trained(folder: Pa
     assert not torch.equal(view.colour, untrained.colour)
 
 
+@pytest.mark.thorough
 def test_a_run_is_opened_with_a_scene_at_an_address(folder: Path) -> None:
     options = Train(folder / "flats", folder / "run", budget=Budget(steps=1), width=48, device="cpu")
     train(options, Console(quiet=True))

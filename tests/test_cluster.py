@@ -246,6 +246,7 @@ def test_a_comparison_of_a_cluster_has_the_figures_of_one_process(address, tmp_p
     assert (tmp_path / "there" / "tables.md").exists()
 
 
+@pytest.mark.thorough
 def test_a_command_that_fails_on_a_worker_is_its_own_error(tmp_path: Path):
     settings = Settings(None, 2, None, "cpu", 0)
     with (

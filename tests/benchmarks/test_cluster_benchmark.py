@@ -58,6 +58,7 @@ def test_maps_are_the_same_if_all_their_files_are(tmp_path: Path) -> None:
     assert cluster._compare(maps) == (2, [os.path.join("a", "x.tif"), "b.laz"])
 
 
+@pytest.mark.thorough
 def test_a_survey_that_is_too_small_is_refused(tmp_path: Path) -> None:
     survey = make_survey("ground_textures", seed=4, views=9, width=96, supersample=1)
     write_survey(survey, tmp_path / "scene")

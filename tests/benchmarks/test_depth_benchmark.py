@@ -28,6 +28,7 @@ def off_by(scene: Scene, metres: float) -> Render:
     return render
 
 
+@pytest.mark.thorough
 def test_known_errors_come_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     scenes: list[Scene] = []

@@ -9,6 +9,7 @@ from scenes_on_disk import PINHOLE, survey, write_colmap
 from benchmarks.view import lines, view
 
 
+@pytest.mark.thorough
 def test_moves_and_rests_are_measured_and_stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("benchmarks.view.SIZE_PX", (64, 48))
     write_colmap(tmp_path / "scene", survey(PINHOLE))

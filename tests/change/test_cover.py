@@ -242,6 +242,7 @@ def test_orthophotos_of_another_place_are_refused(tmp_path: Path):
         measure_cover(here, there, grid)
 
 
+@pytest.mark.thorough
 def test_the_marsh_of_a_built_in_flat_spreads_as_much_as_its_pictures_say():
     from benchmarks.change_cover import covered
     from tidefield.synthetic.grids import Extent

@@ -146,7 +146,9 @@ def test_the_error_of_a_region_that_is_reduced_to_blocks_is_andersons():
     assert found.correlated * 0.25**2 == pytest.approx(correlated, rel=0.02)
 
 
-@pytest.mark.parametrize("reach", [2.0, 6.0, 20.0])
+@pytest.mark.parametrize(
+    "reach", [pytest.param(2.0, marks=pytest.mark.thorough), 6.0, pytest.param(20.0, marks=pytest.mark.thorough)]
+)
 def test_roads_and_roofs_of_a_large_survey_are_no_scattered_ground(reach: float):
     """Two roads one cell wide, and patches of 8 x 8, whose blocks of 8 x 8 are reduced to one number each."""
     n, variogram = 4096, Variogram((0.9,), (reach,))

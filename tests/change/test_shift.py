@@ -99,6 +99,7 @@ def test_pixels_of_orthophotos_are_measured_on_the_ground(tmp_path: Path, system
     assert picture_grid((path, path), grid).cell_m == pytest.approx(expected[system], rel=0.01)
 
 
+@pytest.mark.thorough
 def test_the_later_survey_is_moved_and_its_error_enters_on_slopes(tmp_path: Path):
     east, north = 0.6, -0.45
     rows, columns = np.indices((200, 240))

@@ -77,6 +77,7 @@ def test_train_evaluate_and_render_work_together(scene: Path, run: Path, tmp_pat
     assert video.stat().st_size > 0
 
 
+@pytest.mark.thorough
 def test_a_path_of_a_file_has_its_own_size_unless_another_in_its_proportion_is_given(
     scene: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -100,6 +101,7 @@ def test_a_path_of_a_file_has_its_own_size_unless_another_in_its_proportion_is_g
         assert picture.size == (16, 16)  # of the least height
 
 
+@pytest.mark.thorough
 def test_a_run_is_evaluated_at_another_width_than_its_own_and_with_several_rays(
     scene: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -379,6 +381,7 @@ def test_a_name_is_printed_as_it_is(
     assert printed.count(name.encode(errors="backslashreplace").decode()) >= 2
 
 
+@pytest.mark.thorough
 def test_a_reader_that_is_gone_ends_a_command_quietly(scene: Path, tmp_path: Path) -> None:
     for words in (["import", scene, tmp_path / "new"], ["--version"]):
         reading, writing = os.pipe()

@@ -70,6 +70,7 @@ def test_the_hull_holds_the_ball_and_little_else(size: int):
     assert not hull.contains(CENTRE + outwards * 3).any()
 
 
+@pytest.mark.thorough
 def test_the_hull_holds_an_object_that_is_larger_than_the_frames():
     """Each place of it is in four frames of ten."""
     views = around()
@@ -78,6 +79,7 @@ def test_the_hull_holds_an_object_that_is_larger_than_the_frames():
     assert hull_of(closer, range(24)).contains(CENTRE + 0.97 * RADIUS * outwards).all()
 
 
+@pytest.mark.thorough
 def test_a_new_views_rays_meet_the_surface_within_the_range():
     cameras = around(25)
     hull, new = hull_of(cameras, range(24)), cameras[24]
@@ -157,6 +159,7 @@ def test_scenes_with_alpha_have_the_hull_of_their_training_photographs(tmp_path:
     assert not scene.hull.contains(middle + torch.tensor([0.0, 0.0, 1.5]))
 
 
+@pytest.mark.thorough
 def test_the_hull_is_kept_for_the_next_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     cameras = around()
     write_blender_part(tmp_path, "train", cameras, [alpha for alpha in pictures(cameras).alphas if alpha is not None])

@@ -109,6 +109,7 @@ def test_garbled_text_models_are_refused(tmp_path: Path, file: str, old: str, ne
         read_colmap(tmp_path, folder, False)
 
 
+@pytest.mark.thorough
 def test_many_points_take_little_memory(tmp_path: Path) -> None:
     folder = write_colmap(tmp_path, survey(BARREL))
     layout = [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track", "<u8")]

@@ -111,6 +111,7 @@ def test_light_that_is_quadratic_in_the_direction_is_foretold_for_all_headings(c
     assert "with the direction's squares" in caplog.text
 
 
+@pytest.mark.thorough
 def test_forming_the_normal_matrix_and_iterating_find_the_same(monkeypatch: pytest.MonkeyPatch):
     value, cameras, points = observed(planted())
     seen = seen_in(TRAIN, value, points)

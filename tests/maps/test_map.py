@@ -184,6 +184,7 @@ def test_a_map_that_was_killed_continues_and_is_the_same(scene: Path, out: Path,
     assert not (tmp_path / "map" / make.TILES).exists()
 
 
+@pytest.mark.thorough
 def test_a_map_does_not_continue_with_other_photographs(scene: Path, tmp_path: Path):
     copy = shutil.copytree(scene, tmp_path / "scene")
 

@@ -109,6 +109,7 @@ def test_the_terrain_of_a_long_coast_is_that_of_its_plane(tmp_path: Path):
     np.testing.assert_allclose(read_raster(tmp_path / "dtm.tif")[0], plane, atol=0.01)
 
 
+@pytest.mark.thorough
 def test_the_terrain_of_a_strip_needs_no_search_over_all_of_the_empty_map_around_it(monkeypatch: pytest.MonkeyPatch):
     random = np.random.default_rng(0)
     y, x = np.mgrid[:150, :150]

@@ -125,6 +125,7 @@ def test_a_tile_reaches_from_its_nearest_to_its_farthest_surface(network: Networ
     torch.testing.assert_close(z.reshape(15, 2), depth)
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("small_blocks")
 def test_evicted_blocks_are_encoded_again_alike(network: Network):
     at = scene()

@@ -95,21 +95,31 @@ def test_the_run_holds_the_way_back_to_the_reference_system(trained: tuple[Path,
     np.testing.assert_allclose(np.array(found["transform"])[:, 3], -middle, rtol=0, atol=1e-12)  # not in float32
 
 
-@pytest.mark.parametrize("wide", [False, True], ids=["Brown", "fisheye"])
-def test_the_data_parser_has_the_rays_of_the_lenses(tmp_path: Path, wide: bool):
-    truth = survey(*[FISHEYE] * wide, offset=UTM)
-    write_colmap(tmp_path / "scene", truth)
-    model = pycolmap.Reconstruction(tmp_path / "scene" / "sparse" / "0")
-    for point in model.points3D.values():
-        point.xyz, point.color = point.xyz + 0.3, np.array([1, 2, 3], np.uint8)
-    model.write_binary(tmp_path / "scene" / "sparse" / "0")
-    mask = tmp_path / "scene" / "masks" / f"{sorted(truth.names)[1]}.png"
-    mask.parent.mkdir(parents=True)
-    Image.new("L", (truth.lenses[1].width, truth.lenses[1].height), 0).save(mask)
-    run("rays", tmp_path / "scene", tmp_path / "rays.json")
-    posed, train = read_posed(tmp_path / "scene", False), every_eighth(9)[0]
+@pytest.fixture(scope="module")
+def rays(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a scene of each kind of lens, and with what nerfstudio's data parser makes of it."""
+    folder, words = tmp_path_factory.mktemp("rays"), []
+    for name, lenses in (("Brown", ()), ("fisheye", (FISHEYE,))):
+        scene, truth = folder / name, survey(*lenses, offset=UTM)
+        write_colmap(scene, truth)
+        model = pycolmap.Reconstruction(scene / "sparse" / "0")
+        for point in model.points3D.values():
+            point.xyz, point.color = point.xyz + 0.3, np.array([1, 2, 3], np.uint8)
+        model.write_binary(scene / "sparse" / "0")
+        mask = scene / "masks" / f"{sorted(truth.names)[1]}.png"
+        mask.parent.mkdir(parents=True)
+        Image.new("L", (truth.lenses[1].width, truth.lenses[1].height), 0).save(mask)
+        words += ["rays", scene, folder / f"{name}.json", ":"]
+    run(*words)
+    return folder
+
+
+@pytest.mark.parametrize("name", ["Brown", "fisheye"])
+def test_the_data_parser_has_the_rays_of_the_lenses(rays: Path, name: str):
+    truth, (mask,) = survey(*[FISHEYE] * (name == "fisheye"), offset=UTM), (rays / name / "masks").iterdir()
+    posed, train = read_posed(rays / name, False), every_eighth(9)[0]
     middle, pixel = posed.T_world_camera[:, :, 3].mean(axis=0), np.array([[50.0, 10.0]])
-    found = json.loads((tmp_path / "rays.json").read_text())
+    found = json.loads((rays / f"{name}.json").read_text())
     for values, scale in ((found["metres"], 1.0), (found["scaled"], found["scaled"]["scale"])):
         assert values["files"] == [str(posed.paths[i]) for i in train]
         assert values["masks"][0] == str(mask)

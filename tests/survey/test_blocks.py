@@ -175,6 +175,7 @@ def test_finished_blocks_are_kept_by_a_run_that_continues(survey, tmp_path: Path
     assert (folder / "block_0000" / DONE).stat().st_mtime_ns > kept, "a changed survey starts again"
 
 
+@pytest.mark.thorough
 def test_mapping_opens_no_database_that_another_process_may_be_opening(survey, tmp_path: Path, monkeypatch):
     flight, database = survey
     photographs, own = flight.survey.photographs, shutil.copy(database, tmp_path / "database.db")

@@ -177,6 +177,7 @@ def test_features_of_reduced_photographs_are_where_they_are_in_the_photograph(tm
     assert away.max() < 0.5
 
 
+@pytest.mark.thorough
 def test_photographs_of_twice_the_size_have_the_same_features_twice_as_far_apart(
     wall_photographs: list[Photograph], tmp_path: Path
 ):

@@ -572,6 +572,7 @@ def test_control_in_one_corner_does_not_turn_what_differential_positions_have_pl
     assert len(found.control_world) == 4
 
 
+@pytest.mark.thorough
 def test_a_wrong_point_neither_moves_nor_reshapes_what_differential_positions_have_placed():
     flight = fly(lines=4, each=7, position_m=0.015)
     control = with_control(flight, CONTROL[:4]).control

@@ -120,6 +120,7 @@ def test_control_points_are_not_added_to_the_model(flight):
     assert model.compute_mean_reprojection_error() == pytest.approx(0.36, abs=0.08)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("kept", "why"), [(2, "three are needed"), (15, "they do not follow the photographs")])
 def test_positions_that_took_no_part_are_not_compared_with(flight, kept, why):
     survey = with_control(flight)
@@ -239,6 +240,7 @@ def test_points_in_one_photograph_are_used_and_reported_as_unchecked(flight):
     assert any("G1, G4" in note and "not checked" in note for note in found.notes)
 
 
+@pytest.mark.thorough
 def test_control_removes_the_bend_of_a_wrong_lens(bent):
     true, model, survey = bent
     turned = in_a_frame_of_its_own(model)
@@ -301,6 +303,7 @@ def test_few_points_marked_once_place_nothing_and_are_refused(flight, places):
     assert found.control.names == ("G1",)
 
 
+@pytest.mark.thorough
 def test_many_points_marked_once_adjust_the_model_unless_differential_positions_shape_it():
     plain, accurate = fly(position_m=0.3), fly(position_m=0.015)
     model, found = located(plain, marked_once(with_control(plain)))
@@ -348,6 +351,7 @@ def test_control_in_the_wrong_system_is_an_error(flight):
         located(flight, replace(survey, control=wrong))
 
 
+@pytest.mark.thorough
 def test_marks_in_photographs_without_a_pose_are_left_out(flight):
     survey = with_control(flight)
     astray = with_marks(survey, lambda m: replace(m, photograph="lost.jpg") if m.photograph == name_of(2) else m)

@@ -152,6 +152,7 @@ def test_the_split_is_written_for_nerfstudio_and_the_report_counts_it(made: tupl
     assert page.count('<td class="n">held out</td>') == 2
 
 
+@pytest.mark.thorough
 def test_held_out_photographs_are_no_photographs_without_features_in_the_report(
     made: tuple[Path, Prepared], flight: Flight
 ):

@@ -279,6 +279,7 @@ def test_a_killed_process_of_the_global_mapper_is_one_error(tmp_path: Path, monk
         reconstruct(tmp_path / "database.db", tmp_path, list("abc"), quiet, known=False, mapper="global")
 
 
+@pytest.mark.thorough
 def test_the_same_matches_give_the_same_model_to_the_last_bit(tmp_path: Path):
     names = simulated_matches(tmp_path / "database.db")
 

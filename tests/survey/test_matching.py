@@ -193,6 +193,7 @@ def test_photographs_without_a_time_leave_the_order_of_the_others_as_it_is():
     assert {*pairwise(timed), *zip(timed, timed[2:], strict=False)} <= set(pairs_of(flight))
 
 
+@pytest.mark.thorough
 def test_candidates_of_many_photographs_without_positions_take_little_memory():
     count = 200
     pairs = list(combinations(range(count), 2))
@@ -325,6 +326,7 @@ def test_pairs_are_matched_verified_and_kept(tmp_path: Path):
         assert db.num_matches() == 0, "mapping reads no others"
 
 
+@pytest.mark.thorough
 def test_what_is_not_matched_any_more_is_deleted(tmp_path: Path):
     path = tmp_path / "database.db"
     first, second, third, _ = write_database(path)
@@ -354,6 +356,7 @@ def test_matches_do_not_depend_on_the_number_of_processes(tmp_path: Path, monkey
     assert sorted(path.name for path in tmp_path.iterdir()) == ["many.db", "one.db"]
 
 
+@pytest.mark.thorough
 def test_pairs_without_matches_or_without_a_geometry_are_not_matched_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

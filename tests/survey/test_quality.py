@@ -356,6 +356,7 @@ def test_every_photograph_of_the_real_surveys_is_kept(name, count):
     assert kept == survey
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", ["brighton_beach", "turin_lot"])
 def test_defects_made_of_real_photographs_are_found(name, tmp_path):
     survey = read_survey(real_survey(name))

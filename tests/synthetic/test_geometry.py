@@ -64,6 +64,7 @@ def brute_force(plants: Plants, origin: np.ndarray, direction: np.ndarray) -> fl
     return nearest
 
 
+@pytest.mark.thorough
 def test_plant_depths_match_brute_force() -> None:
     plants = random_plants(np.random.default_rng(1))
     sun = torch.tensor([0.5, 0.3, 0.8])

@@ -60,6 +60,7 @@ def test_error_for_an_unknown_category_lists_the_categories() -> None:
         make_survey("lagoon", seed=0)
 
 
+@pytest.mark.thorough
 def test_depth_points_lie_on_the_ground_or_on_plants_above_it() -> None:
     points = torch.cat([points_of(survey("vegetation"), v) for v in range(0, VIEWS, 3)]).T
     above = points[2] - survey("vegetation").flat.surface.sample(points[:2])[0]
@@ -103,6 +104,7 @@ def test_dry_ground_has_the_same_colour_in_all_photographs() -> None:
     assert (there - here).abs().mean() < 0.025
 
 
+@pytest.mark.thorough
 def test_only_wet_ground_and_water_are_specular() -> None:
     flat = survey().flat
     xy = flat.surface.extent.nodes()[:, ::37]
@@ -162,6 +164,7 @@ def test_every_category_has_overlap_contrast_and_sparse_points(category: str) ->
     assert len(scene.points.xyz_world) > 300
 
 
+@pytest.mark.thorough
 def test_categories_differ_as_their_names_say() -> None:
     water, plants = {}, {}
     for category in CATEGORIES:
@@ -221,6 +224,7 @@ def test_near_and_far_ignore_the_sky() -> None:
     assert torch.allclose(_near_far(depth), torch.tensor([[4.5, 8.8]]))
 
 
+@pytest.mark.thorough
 def test_flight_options_reach_the_flat_and_the_poses() -> None:
     low = make_survey("ground_textures", 4, views=2, width=16, flight=Flight(sun_elevation_deg=12.0), supersample=1)
     assert float(low.flat.light.sun[2]) == pytest.approx(np.sin(np.radians(12.0)))
@@ -246,6 +250,7 @@ def test_flight_options_reach_large_flights() -> None:
     assert wet.ground.maps.values[5].mean() > dry.ground.maps.values[5].mean() + 0.2
 
 
+@pytest.mark.thorough
 def test_water_moves_between_the_photographs_of_large_flights(tmp_path: Path) -> None:
     made = []
     for motion in (0.0, 1.5):
@@ -257,6 +262,7 @@ def test_water_moves_between_the_photographs_of_large_flights(tmp_path: Path) ->
     assert made[0][1] != made[1][1]
 
 
+@pytest.mark.thorough
 def test_flight_options_reach_both_dates_of_a_pair() -> None:
     flights = (
         Flight(altitude_m=20.0, sun_elevation_deg=12.0, wetness=0.0),
