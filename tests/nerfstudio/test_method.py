@@ -116,7 +116,7 @@ def rays(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("name", ["Brown", "fisheye"])
 def test_the_data_parser_has_the_rays_of_the_lenses(rays: Path, name: str):
-    truth, (mask,) = survey(*[FISHEYE] * (name == "fisheye"), offset=UTM), (rays / name / "masks").iterdir()
+    truth, (mask,) = survey(*[FISHEYE] * (name == "fisheye"), offset=UTM), (rays / name / "masks").rglob("*.png")
     posed, train = read_posed(rays / name, False), every_eighth(9)[0]
     middle, pixel = posed.T_world_camera[:, :, 3].mean(axis=0), np.array([[50.0, 10.0]])
     found = json.loads((rays / f"{name}.json").read_text())
