@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from captures import SCENES, TILT, UP, survey
+from captures import SCENES, TILT, UP, scene_of, survey
 from rich.console import Console
 
 from tidefield.commands.render import Render, render
@@ -53,6 +53,22 @@ def test_every_path_has_the_asked_size_and_the_photographs_view_range_and_exposu
     assert (cameras.near_far[:, 0] > 0).all()
     assert (cameras.near_far[:, 1] > cameras.near_far[:, 0]).all()
     assert torch.equal(cameras.gain, torch.ones(31, 3))
+
+
+@pytest.mark.parametrize(
+    "azimuths", [(0.0, math.pi), tuple(0.5 * k for k in range(12))], ids=["opposite", "all around"]
+)
+@pytest.mark.parametrize("outwards", [True, False], ids=["outwards", "inwards"])
+def test_among_cameras_that_look_outwards_or_at_each_other_frames_are_level(
+    azimuths: tuple[float, ...], outwards: bool
+):
+    position = 2 * torch.tensor([[math.cos(a), math.sin(a), 0.0] for a in azimuths])
+    scene = scene_of(position, position if outwards else -position, torch.tensor([0.0, 0.0, 1.0]))
+    poses = path_of("orbit", scene, 8).T_world_camera
+    assert torch.isfinite(poses).all()
+    assert (poses[:, :, 1] @ UP < -0.9).all(), "the picture's down"
+    ahead = poses[:, :, 2]
+    assert (ahead @ ahead.T).min() < -0.5 or len(azimuths) == 2, "all around"
 
 
 @pytest.mark.parametrize("path", PATHS)

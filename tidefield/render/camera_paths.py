@@ -42,6 +42,10 @@ FRAMES_PER_SECOND = 24.0
 # The constants below were chosen by eye on the scenes of docs/results.md, unless a reason is given.
 PARALLEL = 0.95
 """If the mean of the unit viewing directions is longer than this, the cameras all face one way."""
+OPPOSITE = 0.1
+"""If it is shorter than this, they face all ways or two opposite ones, and do not look down."""
+LEVEL = 0.1
+"""Height of the cameras over what they see, in distances to it, below which they look outwards and not down."""
 LONG = 0.7
 """Cameras that face one way and extend farther than this, in distances to the surface, are a survey."""
 STEEPEST = np.radians(30)
@@ -160,7 +164,8 @@ def layout_of(scene: Scene) -> Layout:
     centre = np.median(position + ahead * distance, axis=0)
     if concentration < PARALLEL:
         kind = "around" if focus is not None else "survey"
-        up = _level_normal(rotation) if kind == "around" or _yaws(rotation) else _plane_normal(position, forward)
+        levelled = kind == "around" or _yaws(rotation) or concentration < OPPOSITE
+        up = _level_normal(rotation) if levelled else _plane_normal(position, forward)
         if focus is not None:
             centre, distance = focus, float(np.median(np.linalg.norm(focus - position, axis=1)))
     else:
@@ -204,7 +209,7 @@ def orbit(layout: Layout, frames: int, reach: float = 1.0) -> Poses:
 
     Over a survey: at the flight's height, within the flight lines, at most 30 degrees from nadir. Around an object: at
     the cameras' own distance and height, back and forth if they saw only a part of the circle. Facing a subject: an
-    ellipse within the cameras' own positions.
+    ellipse within the cameras' own positions. Among cameras that look outwards: a turn on the spot.
     """
     turn = np.linspace(0, 2 * np.pi, frames, endpoint=False)
     if layout.kind == "facing":
@@ -220,6 +225,9 @@ def orbit(layout: Layout, frames: int, reach: float = 1.0) -> Poses:
         first, second = layout.long_axes(layout.up)
         away = layout.position - layout.centre
         height = float(np.median(away @ layout.up))
+        if layout.kind == "survey" and abs(height) < LEVEL * layout.distance:
+            around = np.cos(turn)[:, None] * first + np.sin(turn)[:, None] * second
+            return np.broadcast_to(layout.position.mean(0), around.shape), look_along(around, layout.up)
         if layout.kind == "around":
             radius = float(np.median(np.hypot(away @ first, away @ second)))
             turn = _within_azimuths(turn, np.arctan2(away @ second, away @ first))
@@ -289,6 +297,8 @@ def _yaws(rotation: Rotations) -> bool:
 def _level_normal(rotation: Rotations) -> Vector:
     """Return the direction that the right-hand axes of cameras that never roll are perpendicular to."""
     right = rotation[:, :, 0]
+    if not _yaws(rotation):  # as of two cameras that face each other: all directions across are perpendicular to it
+        return -rotation[:, :, 1].mean(0)
     up = np.linalg.eigh(right.T @ right)[1][:, 0]
     return up if up @ (-rotation[:, :, 1] - rotation[:, :, 2]).mean(0) > 0 else -up
 
