@@ -21,8 +21,10 @@ from tidefield.change.surfaces import open_surface
 from tidefield.change.write import write_all
 from tidefield.errors import RunError, TidefieldError
 from tidefield.maps.grid import LOCAL_WKT
-from tidefield.viewer import atlas as atlas_module
-from tidefield.viewer.atlas import STEP, TILE_PX, Atlas, is_sheet
+from tidefield.viewer import rasters
+from tidefield.viewer.atlas import STEP, Atlas
+from tidefield.viewer.rasters import TILE_PX
+from tidefield.viewer.sheets import is_sheet
 
 
 def box(left: float, top: float, right: float, bottom: float) -> np.ndarray:
@@ -275,7 +277,7 @@ def test_a_large_polygon_takes_little_memory(tmp_path: Path, kind: str, monkeypa
     tracemalloc.stop()
     assert found["cells_m2"] == side**2 * CELL**2
     assert peak < 36 * side**2
-    monkeypatch.setattr(atlas_module, "MOST_CELLS", side**2 - 1)
+    monkeypatch.setattr(rasters, "MOST_CELLS", side**2 - 1)
     with pytest.raises(RunError, match=r"covers 1600 x 1600 cells: expected 2,559,999 or fewer; draw a smaller"):
         atlas.area(corners)
 

@@ -92,7 +92,7 @@ def _are_maps(sources: tuple[Path, ...]) -> bool:
     Raises:
         RunError: there are several sources, and one of them is no map.
     """
-    from tidefield.viewer.atlas import is_sheet
+    from tidefield.viewer.sheets import is_sheet
 
     maps = [is_sheet(source) for source in sources]
     if len(sources) == 1 or all(maps):
