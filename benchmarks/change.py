@@ -13,10 +13,11 @@ import shapely
 
 from benchmarks.change_pairs import measure_pairs, summarise
 from benchmarks.records import MEASURED, say
-from tidefield.change.errors import anderson_terms, nmad
+from tidefield.change.errors import anderson_terms
 from tidefield.change.m3c2 import m3c2
 from tidefield.change.measure import measure
 from tidefield.change.regions import Region, read_regions
+from tidefield.change.statistics import nmad
 from tidefield.change.surfaces import ChangeError, Grid, common_grid, open_surface
 from tidefield.compare.tables import NOTHING, Table
 from tidefield.files import read_json, write_json, write_text

@@ -16,10 +16,10 @@ from benchmarks.change import store
 from benchmarks.change_pairs import centres, compared, regions_of, require_options
 from benchmarks.maps import made_map
 from benchmarks.records import MEASURED, say
-from tidefield.change.errors import Z95
 from tidefield.change.inputs import open_survey
 from tidefield.change.measure import Change, measure
 from tidefield.change.regions import Region, dilated
+from tidefield.change.statistics import Z95
 from tidefield.change.surfaces import Grid
 from tidefield.data.load import load_scene
 from tidefield.files import completed_folder, write_json

@@ -19,12 +19,12 @@ from benchmarks.change import store
 from benchmarks.change_pairs import regions_of, require_options
 from benchmarks.maps import made_map
 from benchmarks.records import MEASURED, say
-from tidefield.change.errors import Z95
 from tidefield.change.inputs import open_survey
 from tidefield.change.light import greenness
 from tidefield.change.measure import Options, measure
 from tidefield.change.regions import Region, dilated, rasterised
 from tidefield.change.shift import picture_grid, read_picture
+from tidefield.change.statistics import Z95
 from tidefield.change.surfaces import Grid, Surface, common_grid
 from tidefield.files import completed_folder, write_text
 from tidefield.maps.smoothing import smoothed

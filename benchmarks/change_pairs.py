@@ -12,9 +12,9 @@ import numpy as np
 import torch
 
 from benchmarks.records import say
-from tidefield.change.errors import Z95
 from tidefield.change.measure import Change, measure
 from tidefield.change.regions import Region, dilated
+from tidefield.change.statistics import Z95
 from tidefield.change.surfaces import Grid, open_surface
 from tidefield.change.volumes import Volume
 from tidefield.change.write import polygons_of

@@ -5,8 +5,8 @@ import pytest
 
 from tidefield.change import choice
 from tidefield.change.choice import Choice, repeat_choice
-from tidefield.change.errors import Variogram
 from tidefield.change.outlines import Outlines
+from tidefield.change.variogram import Variogram
 
 NOISE = Variogram((0.5,), (3.0,))
 SIDE = 64

@@ -8,21 +8,12 @@ import pytest
 from scipy.special import stdtrit
 
 from tidefield.change.choice import _root_power, simulate_noise
-from tidefield.change.errors import (
-    UNCORRELATED,
-    Variogram,
-    _joined,
-    _least_squares,
-    anderson_terms,
-    deviation95,
-    fit_variogram,
-    nmad,
-    p_values,
-    region_error,
-)
+from tidefield.change.errors import anderson_terms, degrees_of_freedom, region_error
 from tidefield.change.outlines import window_z
 from tidefield.change.registration import Registration, centre, covariance, offsets
+from tidefield.change.statistics import deviation95, nmad, p_values
 from tidefield.change.surfaces import Grid
+from tidefield.change.variogram import UNCORRELATED, Variogram, _joined, _least_squares, fit_variogram
 from tidefield.change.volumes import Volume
 
 GRID = Grid(None, 100.0, 200.0, 0.5, 26, 20)
@@ -207,7 +198,7 @@ def test_scattered_stable_ground_does_not_make_neighbours_independent():
     whole = np.random.default_rng(1).normal(0, 0.1, (200, 200)).astype(np.float32)
     error = region_error(0.1, region, scattered, 1.0).total
     assert error > 5 * region_error(0.1, region, fit_variogram(whole, 1.0), 1.0).total
-    freedom = scattered.degrees_of_freedom(np.isfinite(residuals), 1.0)
+    freedom = degrees_of_freedom(scattered, np.isfinite(residuals), 1.0)
     assert freedom == pytest.approx(399, rel=0.1), "points 20 m apart are independent of each other"
     assert Volume(0.0, 0.0, 1.0, 0.0, 1.0, degrees_of_freedom=freedom).factor == pytest.approx(1.966, abs=0.002)
 
@@ -244,23 +235,23 @@ def test_degrees_of_freedom_are_the_independent_samples_among_stable_cells_less_
     at = np.argwhere(stable) * 0.5
     distance = np.hypot(*(at[:, None] - at[None]).transpose(2, 0, 1))
     short, long = (len(at) ** 2 / Variogram((1.0,), (reach,)).correlation(distance).sum() - 1 for reach in (4.0, 10.0))
-    assert Variogram((0.5,), (10.0,)).degrees_of_freedom(stable, 0.5) == pytest.approx(long, rel=0.01)
-    both = Variogram((0.6, 0.2), (4.0, 10.0)).degrees_of_freedom(stable, 0.5)
+    assert degrees_of_freedom(Variogram((0.5,), (10.0,)), stable, 0.5) == pytest.approx(long, rel=0.01)
+    both = degrees_of_freedom(Variogram((0.6, 0.2), (4.0, 10.0)), stable, 0.5)
     assert both == pytest.approx((9.6 + 20) ** 2 / (9.6**2 / short + 20**2 / long), rel=0.01)
-    assert Variogram((0.5,), (1000.0,)).degrees_of_freedom(stable, 0.5) == 1
+    assert degrees_of_freedom(Variogram((0.5,), (1000.0,)), stable, 0.5) == 1
     lone = np.zeros((1100, 1100), bool)
     lone[::100, ::100] = True
-    assert Variogram((0.5,), (4.0,)).degrees_of_freedom(lone, 1.0) == 120
+    assert degrees_of_freedom(Variogram((0.5,), (4.0,)), lone, 1.0) == 120
     shore = np.ones((36_000, 50), bool)
-    assert Variogram((0.5,), (1.0,)).degrees_of_freedom(shore, 1.0) == pytest.approx(shore.sum() - 1)
+    assert degrees_of_freedom(Variogram((0.5,), (1.0,)), shore, 1.0) == pytest.approx(shore.sum() - 1)
 
 
 def test_degrees_of_freedom_of_an_area_are_the_independent_pieces_of_it_less_one():
     """Of a range r, a piece has the area pi r^2 / 5; of two ranges, Satterthwaite's sum of sill r^2."""
     stable = np.ones((1100, 900), bool)
     long, short = (5 * 990_000 / (math.pi * reach**2) - 1 for reach in (20.0, 4.0))
-    assert Variogram((0.5,), (20.0,)).degrees_of_freedom(stable, 1.0) == pytest.approx(long, rel=0.05)
-    both = Variogram((0.6, 0.2), (4.0, 20.0)).degrees_of_freedom(stable, 1.0)
+    assert degrees_of_freedom(Variogram((0.5,), (20.0,)), stable, 1.0) == pytest.approx(long, rel=0.05)
+    both = degrees_of_freedom(Variogram((0.6, 0.2), (4.0, 20.0)), stable, 1.0)
     assert both == pytest.approx((9.6 + 80) ** 2 / (9.6**2 / short + 80**2 / long), rel=0.05)
 
 

@@ -11,7 +11,6 @@ import rasterio
 import shapely
 from surveys_of_two_dates import NORTH, WEST, noise, pair, write_surface
 
-from tidefield.change.errors import UNCORRELATED
 from tidefield.change.inputs import open_survey
 from tidefield.change.measure import Change, Options, Register, _slopes, measure
 from tidefield.change.page import limits
@@ -20,6 +19,7 @@ from tidefield.change.registration import Registration
 from tidefield.change.shift import Shift
 from tidefield.change.stable import sampled
 from tidefield.change.surfaces import ChangeError, Grid, common_grid, open_surface
+from tidefield.change.variogram import UNCORRELATED
 from tidefield.change.volumes import ErrorModel, Volume
 from tidefield.change.write import volume_rows, write_tables
 

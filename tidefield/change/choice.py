@@ -18,8 +18,8 @@ from jaxtyping import Float32, Float64
 from scipy.fft import next_fast_len
 from scipy.ndimage import uniform_filter
 
-from tidefield.change.errors import Variogram
 from tidefield.change.outlines import Outlines, find_outlines
+from tidefield.change.variogram import Variogram
 
 _REPEATS = 16
 _TILE = 1024

@@ -22,11 +22,11 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int8, Int32, Int64, UInt8
 from scipy.ndimage import label
 
-from tidefield.change.errors import nmad
 from tidefield.change.light import greenness, light_gains, with_light
 from tidefield.change.nodata import STRIP_CELLS
 from tidefield.change.regions import Region
 from tidefield.change.shift import picture_grid, read_picture
+from tidefield.change.statistics import nmad
 from tidefield.change.surfaces import ChangeError, Grid
 from tidefield.maps.smoothing import smoothed
 

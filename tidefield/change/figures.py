@@ -14,8 +14,8 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from tidefield.change.cover import Cover
-from tidefield.change.errors import Z95
 from tidefield.change.measure import Change
+from tidefield.change.statistics import Z95
 from tidefield.change.surfaces import Grid
 from tidefield.change.water import Waterline
 from tidefield.maps.figures import INCHES, RULE, SOFT, Extent, figure_of, map_of, png

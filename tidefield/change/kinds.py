@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from tidefield.change.errors import nmad
+from tidefield.change.statistics import nmad
 
 SAME, LIGHT, COLOUR, LOWER, HIGHER, GAINED, LOST, UNKNOWN = range(8)
 """Kinds of difference: none, light only, colour of the ground, height, plants; not seen or not compared."""

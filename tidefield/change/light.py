@@ -7,7 +7,7 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from tidefield.change.errors import nmad
+from tidefield.change.statistics import nmad
 
 _DARK = 4.0
 """Added to 8-bit values before ratios are taken: what is darker is noise."""

@@ -18,13 +18,14 @@ from jaxtyping import Bool, Float32
 from pyproj import CRS
 
 from tidefield.change.choice import repeat_choice
-from tidefield.change.errors import Z95
+from tidefield.change.errors import degrees_of_freedom
 from tidefield.change.outlines import WINDOWS, Outlines, find_outlines
 from tidefield.change.regions import Region, rasterised
 from tidefield.change.registration import LEAST_STABLE, Model
 from tidefield.change.repeats import leave_out_repeated, rounding_m
 from tidefield.change.shift import Shift, find_shift
 from tidefield.change.stable import MOST_SAMPLED, false_alarms, sampled, settle
+from tidefield.change.statistics import Z95
 from tidefield.change.surfaces import ChangeError, Grid, Surface, compared_grid, open_surface, other_datums, warped
 from tidefield.change.volumes import ErrorModel, Volume
 from tidefield.errors import list_names
@@ -276,7 +277,7 @@ def measure(
         dz[rows] -= registration.plane(grid, rows)
     if len(on_water):
         on_water -= np.concatenate([registration.plane(grid, rows)[wet[rows]] for rows in grid.strips()])
-    degrees = variogram.degrees_of_freedom(ground, grid.cell_m)
+    degrees = degrees_of_freedom(variogram, ground, grid.cell_m)
     errors = ErrorModel(sigma, variogram, registration, grid, degrees, slopes, options.datum_error_m or 0.0)
     alarms = false_alarms(dz, errors, ground)
     shown = sampled(dz, ground), shown_before

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float32, Int32
 from scipy.ndimage import find_objects, label, maximum_filter, median_filter, uniform_filter
 from scipy.special import ndtr
 
-from tidefield.change.errors import Variogram, mean_correlation
+from tidefield.change.variogram import Variogram, mean_correlation
 
 FALSE_DISCOVERIES = 0.001
 WINDOWS = (5, 11, 21)

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from tidefield.change.cover import Area, Cover
-from tidefield.change.errors import colour_limit
 from tidefield.change.figures import (
     draw_change,
     draw_cover,
@@ -23,6 +22,7 @@ from tidefield.change.figures import (
 from tidefield.change.kinds import View
 from tidefield.change.measure import Change
 from tidefield.change.pictures import difference, jpeg, side_by_side
+from tidefield.change.statistics import colour_limit
 from tidefield.change.volumes import Volume
 from tidefield.change.water import Water
 from tidefield.change.write import outline_rows

@@ -13,8 +13,10 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
-from tidefield.change.errors import Variogram, deviation95, nmad, pair_covariance
+from tidefield.change.errors import pair_covariance
+from tidefield.change.statistics import deviation95, nmad
 from tidefield.change.surfaces import ChangeError, Grid
+from tidefield.change.variogram import Variogram
 
 LEAST_STABLE = 100
 """Cells of stable ground."""

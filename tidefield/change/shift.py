@@ -21,7 +21,7 @@ from jaxtyping import Float32, Float64, UInt8
 from pyproj import CRS, Transformer
 from pyproj.exceptions import ProjError
 
-from tidefield.change.errors import nmad
+from tidefield.change.statistics import nmad
 from tidefield.change.surfaces import ChangeError, Grid, longer_side, opened, warped
 from tidefield.geometry.geodesy import horizontal, same_system
 

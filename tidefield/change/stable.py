@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Bool, Float32
 from scipy.ndimage import uniform_filter
 
-from tidefield.change.errors import Z95, Variogram, deviation95, fit_variogram, nmad
 from tidefield.change.outlines import find_outlines
 from tidefield.change.regions import dilated
 from tidefield.change.registration import (
@@ -21,7 +20,9 @@ from tidefield.change.registration import (
     lowered,
     statistics,
 )
+from tidefield.change.statistics import Z95, deviation95, nmad
 from tidefield.change.surfaces import ChangeError, Grid
+from tidefield.change.variogram import Variogram, fit_variogram
 from tidefield.change.volumes import ErrorModel
 
 _TURNS = 4

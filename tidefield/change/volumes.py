@@ -10,9 +10,11 @@ import numpy as np
 from jaxtyping import Bool, Float32
 from scipy.special import stdtrit
 
-from tidefield.change.errors import Z95, Variogram, region_error
+from tidefield.change.errors import region_error
 from tidefield.change.registration import Registration
+from tidefield.change.statistics import Z95
 from tidefield.change.surfaces import Grid
+from tidefield.change.variogram import Variogram
 
 
 @dataclass(frozen=True)

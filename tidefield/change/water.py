@@ -19,8 +19,8 @@ from scipy.ndimage import maximum_filter, minimum_filter, uniform_filter
 from scipy.spatial import KDTree
 
 from tidefield.change.cover import Area, small_patches
-from tidefield.change.errors import Z95
 from tidefield.change.measure import Change
+from tidefield.change.statistics import Z95
 from tidefield.change.surfaces import Grid
 from tidefield.maps.smoothing import smoothed
 

@@ -18,8 +18,8 @@ from shapely.geometry.base import BaseGeometry
 
 from tidefield import __version__
 from tidefield.change.cover import LEAST_M2, Cover
-from tidefield.change.errors import Z95, colour_limit, p_values
 from tidefield.change.measure import Change
+from tidefield.change.statistics import Z95, colour_limit, p_values
 from tidefield.change.surfaces import PLAIN, Grid, Surface, opened
 from tidefield.change.volumes import Volume
 from tidefield.change.water import Water, Waterline

@@ -18,8 +18,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64
 from PIL import Image
 
-from tidefield.change.errors import Z95, Variogram, region_error
+from tidefield.change.errors import region_error
+from tidefield.change.statistics import Z95
 from tidefield.change.surfaces import PLAIN, Surface
+from tidefield.change.variogram import Variogram
 from tidefield.change.volumes import Volume
 from tidefield.errors import RunError
 from tidefield.geometry.geodesy import is_local

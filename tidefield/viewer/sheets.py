@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from tidefield.change.errors import colour_limit
 from tidefield.change.inputs import ORTHOPHOTOS, SURFACES, first_of
+from tidefield.change.statistics import colour_limit
 from tidefield.change.surfaces import Surface, date_in, open_surface, opened, system_of_ground
 from tidefield.errors import RunError
 from tidefield.files import read_json
