@@ -50,6 +50,7 @@ def address():
     ray.shutdown()
 
 
+@pytest.mark.thorough
 def test_every_item_is_worked_on_and_a_worker_prepares_once(address, tmp_path: Path):
     @contextmanager
     def prepare():
@@ -60,6 +61,7 @@ def test_every_item_is_worked_on_and_a_worker_prepares_once(address, tmp_path: P
     assert 1 <= len(list(tmp_path.glob("prepared *"))) <= 4
 
 
+@pytest.mark.thorough
 def test_items_come_in_their_order_if_that_is_wanted(address):
     @contextmanager
     def prepare():
@@ -75,6 +77,7 @@ def test_items_come_in_their_order_if_that_is_wanted(address):
     assert [item for item, _ in on_cluster(ray, "order", prepare, range(6), in_order=True)] == list(range(6))
 
 
+@pytest.mark.thorough
 def test_what_a_worker_has_open_is_closed_before_it_opens_something_else(address, tmp_path: Path):
     @contextmanager
     def prepare(name):
@@ -86,6 +89,7 @@ def test_what_a_worker_has_open_is_closed_before_it_opens_something_else(address
         assert {made for _, made in on_cluster(ray, name, partial(prepare, name), range(6))} == {name}
 
 
+@pytest.mark.thorough
 def test_an_error_of_the_function_is_raised_as_it_is(address):
     @contextmanager
     def prepare():
@@ -134,6 +138,7 @@ def test_a_killed_worker_costs_one_task_and_nothing_else(address, tmp_path: Path
     assert attempts == 10 + 3
 
 
+@pytest.mark.thorough
 def test_an_item_of_a_group_comes_when_it_is_done(address, tmp_path: Path):
     @contextmanager
     def prepare():
@@ -170,6 +175,7 @@ def test_a_killed_worker_s_group_goes_on_where_it_was(address, tmp_path: Path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["1", "3", "5"]
 
 
+@pytest.mark.thorough
 def test_an_error_within_a_group_is_raised_as_it_is(address):
     @contextmanager
     def prepare():

@@ -116,6 +116,7 @@ def test_pixels_are_drawn_from_training_photographs_alone_with_their_own_colours
         torch.testing.assert_close(rgb * 255, scene.photographs[index][v, u].float())
 
 
+@pytest.mark.thorough
 def test_it_learns_a_wall(monkeypatch: pytest.MonkeyPatch):
     def ramps(xy: torch.Tensor) -> torch.Tensor:
         x, y = xy[..., 0], xy[..., 1]

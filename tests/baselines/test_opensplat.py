@@ -162,6 +162,7 @@ def test_steps_are_made_and_nothing_is_saved_on_the_way(scene: Scene, program: P
     assert opensplat.progress_of(run).step == 12
 
 
+@pytest.mark.thorough
 def test_minutes_end_training_and_the_last_save_counts(
     scene: Scene, program: Path, run: Path, monkeypatch: pytest.MonkeyPatch
 ):

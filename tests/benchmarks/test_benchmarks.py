@@ -123,6 +123,7 @@ def test_the_measuring_process_stays_small() -> None:
     subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parents[2], check=True)
 
 
+@pytest.mark.thorough
 def test_a_large_frame_is_rendered_from_large_photographs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(memory, "SURVEY_WIDTH", 32)

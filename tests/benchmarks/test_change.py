@@ -148,6 +148,7 @@ def test_photographs_of_the_chain_come_with_control_that_fits_them(pair, chain):
     assert truth.bare(0, 1).dtype == bool
 
 
+@pytest.mark.thorough
 def test_control_stands_under_no_plant_wherever_the_marsh_is(pair, monkeypatch):
     from dataclasses import replace
 
@@ -193,6 +194,7 @@ def test_bare_ground_of_the_chain_has_no_plants_on_it(pair, chain):
         assert ((above > 0.5) & (marsh < 0.02)).sum() > 20
 
 
+@pytest.mark.thorough
 def test_plants_outside_the_marsh_are_true_cover(pair):
     from benchmarks.change_cover import covered
     from tidefield.synthetic.grids import Extent

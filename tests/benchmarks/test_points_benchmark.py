@@ -88,6 +88,7 @@ def test_a_split_that_differs_is_found(flat: Path, tmp_path: Path):
         points((flat,), tmp_path, tmp_path, (100,), "cpu", run)
 
 
+@pytest.mark.thorough
 def test_posed_photographs_get_the_points_of_colmap(flat: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     bent = replace(read_posed(flat, True), points=None)
     own = Lens(**{**vars(bent.lenses[0].resized(640, 480)), "k1": 1e-4, "k3": 1e-5})

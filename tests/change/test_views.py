@@ -188,6 +188,7 @@ def test_a_local_scene_and_a_georeferenced_one_are_refused(scene: Scene):
         carried(scene.cameras[0], local, georeferenced(scene, 0.0))
 
 
+@pytest.mark.thorough
 def test_pictures_are_written_and_need_nothing_else(tmp_path: Path):
     rng = np.random.default_rng(1)
     pictures = rng.integers(0, 255, (2, 61, 90, 3)).astype(np.uint8)

@@ -454,6 +454,7 @@ def across_a_wall(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pretrain, "validation_scenes", lambda *_: {"wall": at})
 
 
+@pytest.mark.thorough
 def test_a_pretraining_that_died_before_its_first_save_starts_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -489,6 +490,7 @@ def test_a_pretraining_that_died_before_its_first_save_starts_again(
             pretrain_command(Pretrain(tmp_path / "out", resume=True, **options, **others), QUIET)
 
 
+@pytest.mark.thorough
 def test_a_pretraining_is_not_continued_with_another_scene_of_the_same_name(
     tmp_path: Path, scene: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -761,6 +761,7 @@ def test_mistakes_are_reported_before_anything_is_trained(disk: Path, monkeypatc
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("name", "damaged"),
     [

@@ -100,6 +100,7 @@ def test_an_area_has_the_same_photographs_at_twice_the_size(scene: Scene):
     assert torch.equal(area.doubled.cameras.size_px, 2 * area.scene.cameras.size_px)
 
 
+@pytest.mark.thorough
 def test_training_reads_what_it_is_prepared_with(scene: Scene):
     config = replace(SWIFT, train=replace(SWIFT.train, tile_px=8, tiles=2, crop_px=16))
     losses = []

@@ -96,6 +96,7 @@ def test_a_new_views_rays_meet_the_surface_within_the_range():
     torch.testing.assert_close(far[0, 0], far.max())
 
 
+@pytest.mark.thorough
 def test_a_view_that_misses_the_hull_keeps_its_near_and_far():
     cameras = around()
     hull = hull_of(cameras, range(24))
@@ -116,6 +117,7 @@ def test_no_hull_without_silhouettes_or_if_they_contradict_each_other():
     assert visual_hull(cameras, replace(truth, alphas=nowhere), range(24)) is None
 
 
+@pytest.mark.thorough
 def test_the_depth_prior_lies_within_the_hull():
     cameras = around(25)
     hull, new = hull_of(cameras, range(24)), cameras[24]

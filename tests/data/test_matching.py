@@ -65,6 +65,7 @@ def test_the_wall_is_found_from_a_start_that_is_off(factor: float):
         assert before.median() > 10 * inner.median(), "the start was right already"
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("size", [(400, 300), (800, 600)])
 def test_first_levels_are_small_whatever_the_size(monkeypatch: pytest.MonkeyPatch, size: tuple[int, int]):
     at = scene(*size)

@@ -64,6 +64,7 @@ def test_coarser_levels_are_means_and_use_only_what_is_used_in_full():
     assert torch.equal(mask, (torch.arange(64) >= 32).expand(48, -1))
 
 
+@pytest.mark.thorough
 def test_a_much_smaller_view_does_not_alias():
     cameras = wall.cameras(5, 512, 384, step=0.25)
     scene = wall.scene(cameras, (2,))

@@ -114,6 +114,7 @@ def rays(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", ["Brown", "fisheye"])
 def test_the_data_parser_has_the_rays_of_the_lenses(rays: Path, name: str):
     truth, (mask,) = survey(*[FISHEYE] * (name == "fisheye"), offset=UTM), (rays / name / "masks").rglob("*.png")

@@ -121,6 +121,7 @@ def test_a_strip_of_one_pixel_has_no_features(tmp_path: Path):
     assert extract([strip], tmp_path / "a.db", OPTIONS, CPU, lambda done, whole: None) == 0
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("transparent", [False, True])
 def test_masked_and_transparent_pixels_have_no_features(
     wall_photographs: list[Photograph], tmp_path: Path, transparent: bool

@@ -28,6 +28,7 @@ def located(name: str, control: bool = True) -> tuple[pycolmap.Reconstruction, G
     return model, georeference(model, survey, lambda done, whole: None)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("name", "epsg", "horizontal_m", "vertical_m"),
     [("brighton_beach", 32615, 0.56, 0.15), ("swindale", 32630, 1.9, 2.2)],

@@ -146,6 +146,7 @@ def adjusted_with(flight: Flight, focal_px: float) -> pycolmap.Reconstruction:
     return model
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("true", "design", "used"), [(1.0, 1.04, 1.0), (1.04, 1.0, 1.0), (1.04, 1.035, 1.04)])
 def test_of_two_stated_focal_lengths_the_one_with_the_drones_flight_height_is_chosen(true, design, used):
     """The stated calibration is `true` times the real focal length; the drone's own height is right."""

@@ -208,6 +208,7 @@ def test_the_same_findings_give_the_same_page(html, tmp_path):
     assert report(full(), tmp_path)[0] == html
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", ["$x$ $", "点.JPG", "a\x01b"])
 def test_any_name_of_a_point_can_be_drawn(tmp_path, name):
     check = Residuals((name,), np.array([[0.01, 0.02, 0.03]]))
@@ -506,6 +507,7 @@ def test_numbers_become_plain_python_and_durations_are_formatted():
     ]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("behind_m", "text"), [(0.8, "0.80 m behind"), (-0.8, "0.80 m ahead of"), (0.02, None)])
 def test_residuals_in_two_clusters_are_remarked_with_the_lag_of_the_clocks(tmp_path, behind_m, text):
     position = flight(4, 6)

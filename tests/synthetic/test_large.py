@@ -58,6 +58,7 @@ def test_strips_overlap_as_planned(flight):
     assert (np.diff(places[1, :, 1]) < 0).all(), "the second strip is flown back"
 
 
+@pytest.mark.thorough
 def test_photographs_do_not_depend_on_plants_elsewhere():
     made = make_survey("vegetation", seed=3, views=6, width=48, supersample=1)
     camera = made.cameras[2]
@@ -97,6 +98,7 @@ def test_a_folder_of_another_flight_or_of_something_else_is_refused(flight, tmp_
     assert json.loads((flight / TRUTH_FILE).read_text())["plan"]["seed"] == 3
 
 
+@pytest.mark.thorough
 def test_the_scene_of_a_flight_has_its_true_poses_and_points_on_the_mud(flight, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     write_large_scene(PLAN, flight, tmp_path / "scene")

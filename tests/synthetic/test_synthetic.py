@@ -70,6 +70,7 @@ def test_depth_points_lie_on_the_ground_or_on_plants_above_it() -> None:
     assert 0.5 < above.max() < 6.0
 
 
+@pytest.mark.thorough
 def test_depths_of_two_views_agree() -> None:
     scene = survey("vegetation")
     points = points_of(scene, 4)[::97]
@@ -176,6 +177,7 @@ def test_categories_differ_as_their_names_say() -> None:
     assert max(plants, key=lambda c: plants[c]) == "vegetation"
 
 
+@pytest.mark.thorough
 def test_gains_and_moving_water_are_optional() -> None:
     assert torch.equal(survey().cameras.gain, torch.ones(VIEWS, 3))
     flight = Flight(exposure_spread=0.2, water_motion=1.5)
@@ -197,6 +199,7 @@ def test_gains_and_moving_water_are_optional() -> None:
     assert not changed[2].reshape(-1)[(deep == 0) & (above < 1e-3)].any()
 
 
+@pytest.mark.thorough
 def test_a_small_photograph_averages_a_large_one() -> None:
     scene = survey("river_mouths")
     camera = scene.cameras[[5]]
@@ -240,6 +243,7 @@ def test_flight_options_reach_the_flat_and_the_poses() -> None:
     assert torch.equal(survey().cameras.forward_world[:, 2] < -0.98, torch.ones(VIEWS, dtype=torch.bool))
 
 
+@pytest.mark.thorough
 def test_flight_options_reach_large_flights() -> None:
     def flat(**options: float) -> TidalFlat:
         flight = Flight(altitude_m=20.0, **options)  # type: ignore[arg-type]

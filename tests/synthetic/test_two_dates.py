@@ -48,6 +48,7 @@ def test_surveys_have_the_errors_that_were_asked_for():
     assert np.corrcoef(found[:-1].ravel(), found[1:].ravel())[0, 1] > 0.95
 
 
+@pytest.mark.thorough
 def test_photographs_of_both_dates_show_the_flat_that_changed(pair: Pair):
     change = pair.ground_change.values
     assert float(change.abs().max()) > 0.25
@@ -60,6 +61,7 @@ def test_photographs_of_both_dates_show_the_flat_that_changed(pair: Pair):
     )
 
 
+@pytest.mark.thorough
 def test_only_what_changed_differs_between_the_dates():
     difference = Difference(change_m=0.0, marsh_growth=1.2, tide_m=0.0)
     pair = make_pair("tidal_trees", 200, difference, views=2, width=32, supersample=1)
@@ -80,6 +82,7 @@ def test_only_what_changed_differs_between_the_dates():
     assert torch.equal(flats[0].light.noise.table, flats[1].light.noise.table)
 
 
+@pytest.mark.thorough
 def test_plants_stand_on_the_ground_of_their_date():
     """A bar of 1 m lifts the tufts on it by as much."""
     pair = make_pair("vegetation", 3, Difference(1.0, marsh_growth=1.0, tide_m=0.0), views=2, width=32, supersample=1)
@@ -92,6 +95,7 @@ def test_plants_stand_on_the_ground_of_their_date():
     assert float(above[0].median()) == pytest.approx(float(above[1].median()), abs=0.05)
 
 
+@pytest.mark.thorough
 def test_flights_can_be_written_where_opencv_cannot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pair: Pair):
     """Its `imwrite` takes no other names than ASCII on Windows."""
     monkeypatch.setattr(cv2, "imwrite", lambda *_: False)
