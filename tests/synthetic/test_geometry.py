@@ -45,14 +45,13 @@ def make_camera(width: int = 40, tilt: float = 0.4) -> Cameras:
 
 def brute_force(plants: Plants, origin: np.ndarray, direction: np.ndarray) -> float:
     """Return the first depth of one ray: leaves by their definition, stems by small steps along the ray."""
-    nearest = math.inf
     leaves = plants.leaves
-    for i in range(len(leaves)):
-        c, u, v = (x[:, i].double().numpy() for x in (leaves.centre, leaves.u, leaves.v))
-        t, a, b = np.linalg.solve(np.column_stack([direction, -u, -v]), c - origin)
-        angle = float(leaves.lobes[i]) * math.atan2(b, a) + float(leaves.phase[i])
-        if t > 0 and math.hypot(a, b) <= 1 - float(leaves.notch[i]) * (1 + math.cos(angle)) / 2:
-            nearest = min(nearest, t)
+    c, u, v = (x.T.double().numpy() for x in (leaves.centre, leaves.u, leaves.v))
+    lobes, phase, notch = (x.double().numpy() for x in (leaves.lobes, leaves.phase, leaves.notch))
+    matrix = np.stack([np.broadcast_to(direction, u.shape), -u, -v], axis=-1)
+    t, a, b = np.linalg.solve(matrix, (c - origin)[..., None])[..., 0].T
+    met = (t > 0) & (np.hypot(a, b) <= 1 - notch * (1 + np.cos(lobes * np.arctan2(b, a) + phase)) / 2)
+    nearest = float(t[met].min(initial=math.inf))
     depth = np.arange(0, 16, 0.004)
     points = origin[:, None] + direction[:, None] * depth
     for start, end, radius in zip(plants.stems.start.T, plants.stems.end.T, plants.stems.radius, strict=True):
@@ -75,7 +74,7 @@ def test_plant_depths_match_brute_force() -> None:
     ]
     for view in views:
         depth, number = plants.nearest(view)
-        ray = torch.arange(0, len(depth), len(depth) // 250)
+        ray = torch.arange(0, len(depth), len(depth) // 200)
         origin, direction = (x.expand(3, len(ray)).double().numpy() for x in view.rays(ray))
         expected = np.array([brute_force(plants, o, d) for o, d in zip(origin.T, direction.T, strict=True)])
         hit = np.isfinite(expected)

@@ -16,11 +16,12 @@ from tidefield.synthetic.large import (
     TRUTH_FILE,
     LargeFlight,
     make_large_flight,
+    planned_flight,
     true_positions,
     write_large_scene,
 )
 
-PLAN = LargeFlight("vegetation", seed=3, strips=2, each=4, width=64, gps_m=2.0, flight=Flight(altitude_m=20.0))
+PLAN = LargeFlight("vegetation", seed=3, strips=2, each=4, width=64, gps_m=2.0, flight=Flight(focal_ratio=2.4))
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +42,7 @@ def test_photographs_are_read_as_a_survey_with_noisy_positions_and_the_true_lens
         place = photograph.position
         assert place is not None
         assert photograph.lens is not None
-        assert photograph.lens.focal_px == pytest.approx(0.8 * 64, rel=1e-3)
+        assert photograph.lens.focal_px == pytest.approx(2.4 * 64, rel=1e-3)
         stated = np.array([[place.longitude_deg, place.latitude_deg, place.height_m]])
         errors.append((frame.from_geographic(stated) - frame.from_geographic(np.array([truth[photograph.name]])))[0])
     assert 0.5 < np.std(np.array(errors)[:, :2]) / 2.0 < 2.0
@@ -49,9 +50,9 @@ def test_photographs_are_read_as_a_survey_with_noisy_positions_and_the_true_lens
     assert (np.diff(times) == 3.0).all()
 
 
-def test_strips_overlap_as_planned(flight):
-    frame = LocalFrame.at(WGS84, (8.3, 53.7, 0.0))
-    places = frame.from_geographic(np.array(list(true_positions(flight).values()))).reshape(2, 4, 3)
+def test_strips_overlap_as_planned():
+    cameras = planned_flight(replace(PLAN, flight=Flight(altitude_m=20.0)))[0]
+    places = cameras.position_world.double().numpy().reshape(2, 4, 3)
     across, along = 20 / 0.8, 20 / 0.8 * 0.75
     assert np.diff(places[..., 0].mean(1)) == pytest.approx(0.3 * across, abs=0.5)
     assert np.diff(places[0, :, 1]) == pytest.approx(np.full(3, 0.2 * along), abs=1.2)
@@ -60,7 +61,7 @@ def test_strips_overlap_as_planned(flight):
 
 @pytest.mark.thorough
 def test_photographs_do_not_depend_on_plants_elsewhere():
-    made = make_survey("vegetation", seed=3, views=6, width=48, supersample=1)
+    made = make_survey("vegetation", seed=3, views=6, width=48, flight=PLAN.flight, supersample=1)
     camera = made.cameras[2]
     corners = torch.tensor([[0.0, 0.0], [48, 0], [0, 36], [48, 36]])
     ground = camera.position_world[0] + camera.directions_world(corners[None])[0] * (camera.position_world[0, 2] + 3)
