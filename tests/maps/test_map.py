@@ -18,7 +18,7 @@ from tidefield.data.georeference import Georeference, Residuals
 from tidefield.errors import RunError
 from tidefield.geometry.geodesy import LocalFrame
 from tidefield.geometry.similarity import Similarity
-from tidefield.maps import make, terrain
+from tidefield.maps import figures, make, terrain
 from tidefield.maps.make import AGREEMENT, CLASSES, CLOUD, DSM, MAIN, MAP_FILE, ORTHOPHOTO, SIGMA, VIEWS
 from tidefield.synthetic import Flight, make_survey, write_survey
 
@@ -55,6 +55,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Any:
         patch.setattr(make, "SMALLEST_TILE", 32)
         patch.setattr(make, "CLOUD_ROWS", 8)
         patch.setattr(terrain, "ROWS", 20)
+        patch.setattr(figures, "_DPI", 20)
         yield
 
 
@@ -63,7 +64,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Nine photographs of bare, textured ground, with uneven exposures."""
     folder = tmp_path_factory.mktemp("flat") / "scene"
     flight = Flight(exposure_spread=0.15)
-    write_survey(make_survey("ground_textures", seed=4, views=9, width=240, flight=flight), folder)
+    write_survey(make_survey("ground_textures", seed=4, views=9, width=240, flight=flight, supersample=1), folder)
     return folder
 
 
