@@ -16,13 +16,15 @@ from tidefield.data.cache import ESTIMATES_SUFFIX
 from tidefield.data.load import load_scene
 from tidefield.data.readers.posed import PosedPhotographs
 from tidefield.data.scene import Scene
-from tidefield.synthetic import make_survey, write_survey
+from tidefield.synthetic import Flight, make_survey, write_survey
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("estimates") / "scene"
-    write_survey(make_survey("ground_textures", seed=2, views=9, width=96, supersample=1), made)
+    flight = Flight(focal_ratio=2.4)
+    survey = make_survey("ground_textures", seed=2, views=9, width=64, flight=flight, supersample=1)
+    write_survey(survey, made, truth=False)
     return made
 
 
@@ -54,7 +56,7 @@ def test_a_scene_is_estimated_once(folder: Path, tmp_path: Path, monkeypatch: py
     require_equal(first, load_scene(folder, cache=tmp_path))
 
 
-@pytest.mark.parametrize("options", [{"hold_out": False}, {"calibrate": False}, {"width": 64}])
+@pytest.mark.parametrize("options", [{"hold_out": False}, {"calibrate": False}, {"width": 32}])
 def test_other_options_are_estimated_anew(folder: Path, tmp_path: Path, options: dict) -> None:
     load_scene(folder, cache=tmp_path)
     changed = load_scene(folder, cache=tmp_path, **options)

@@ -20,7 +20,7 @@ from tidefield.maps.grid import Grid, MapFrame, map_frame
 from tidefield.maps.rasters import Raster, raster_writer
 from tidefield.survey.io.gcp_file import write_check_points
 from tidefield.survey.survey import CHECK_FILE, Control, Mark
-from tidefield.synthetic import make_survey, write_survey
+from tidefield.synthetic import Flight, make_survey, write_survey
 
 FRAME = LocalFrame.at("EPSG:27700", (351_200.0, 512_900.0, 260.0))
 WORLD = np.array([[1.0, 2.0, 0.3], [-2.0, 1.0, 0.1], [0.5, -2.5, -0.2]])
@@ -29,7 +29,9 @@ WORLD = np.array([[1.0, 2.0, 0.3], [-2.0, 1.0, 0.1], [0.5, -2.5, -0.2]])
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     folder = tmp_path_factory.mktemp("flat")
-    write_survey(make_survey("ground_textures", seed=4, views=6, width=64), folder / "scene")
+    flight = Flight(focal_ratio=2.4)
+    survey = make_survey("ground_textures", seed=4, views=6, width=64, flight=flight, supersample=1)
+    write_survey(survey, folder / "scene", truth=False)
     there = Similarity(1.0, np.eye(3), np.zeros(3))
     Georeference(FRAME, "GPS", there, Residuals(), Residuals(), Residuals(), (), ()).write(folder / "scene")
     return load_scene(folder / "scene", hold_out=False, calibrate=False, cache=folder / "cache")

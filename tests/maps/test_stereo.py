@@ -28,7 +28,7 @@ CELL = 0.2
 def scene(tmp_path_factory: pytest.TempPathFactory):
     folder = tmp_path_factory.mktemp("stereo")
     survey = make_survey("ground_textures", seed=4, views=9, width=320, supersample=1)
-    write_survey(survey, folder / "scene")
+    write_survey(survey, folder / "scene", truth=False)
     return load_scene(folder / "scene", hold_out=False, cache=folder / "cache"), survey
 
 

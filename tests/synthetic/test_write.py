@@ -11,12 +11,12 @@ import torch
 
 from tidefield.data.load import load_scene
 from tidefield.errors import SceneError
-from tidefield.synthetic import Survey, make_survey, write_survey
+from tidefield.synthetic import Flight, Survey, make_survey, write_survey
 
 
 @pytest.fixture(scope="module")
 def survey() -> Survey:
-    return make_survey("river_mouths", seed=2, views=9, width=120, supersample=1)
+    return make_survey("river_mouths", seed=2, views=9, width=120, flight=Flight(focal_ratio=1.6), supersample=1)
 
 
 @pytest.fixture(scope="module")
