@@ -15,6 +15,7 @@ from tidefield.data.depth_prior import surface_prior
 from tidefield.data.hull import Hull, hull_range, visual_hull
 from tidefield.data.images import Photographs
 from tidefield.data.load import load_scene
+from tidefield.data.scene import Scene
 from tidefield.geometry.cameras import Cameras, pixel_grid
 
 CENTRE, RADIUS = torch.tensor([5.0, -3.0, 2.0]), 0.8
@@ -53,16 +54,22 @@ def pictures(cameras: Cameras) -> Photographs:
     return Photographs(tuple(torch.zeros(*a.shape, 3, dtype=torch.uint8) for a in alphas), tuple(alphas))
 
 
-def hull_of(cameras: Cameras, train: range) -> Hull:
-    found = visual_hull(cameras, pictures(cameras), train)
+def hull_of(cameras: Cameras) -> Hull:
+    """Of the first 24."""
+    found = visual_hull(cameras, pictures(cameras), range(24))
     assert found is not None
     return found
 
 
+@pytest.fixture(scope="module")
+def hull() -> Hull:
+    return hull_of(around(25))
+
+
 @pytest.mark.thorough
-@pytest.mark.parametrize("size", [80, 900])
-def test_the_hull_holds_the_ball_and_little_else(size: int):
-    hull = hull_of(around(size=size), range(24))
+@pytest.mark.parametrize("size", [80, 500])
+def test_the_hull_holds_the_ball_and_little_else(hull: Hull, size: int):
+    hull = hull if size == 80 else hull_of(around(size=size))
     drawn = torch.randn(20_000, 3, generator=torch.Generator().manual_seed(0))
     outwards = torch.nn.functional.normalize(drawn)
     assert hull.contains(CENTRE + outwards * 0.999 * RADIUS).all()
@@ -76,13 +83,12 @@ def test_the_hull_holds_an_object_that_is_larger_than_the_frames():
     views = around()
     closer = replace(views, focal_px=2.6 * views.focal_px)
     outwards = torch.nn.functional.normalize(CENTRE - views.position_world, dim=-1)
-    assert hull_of(closer, range(24)).contains(CENTRE + 0.97 * RADIUS * outwards).all()
+    assert hull_of(closer).contains(CENTRE + 0.97 * RADIUS * outwards).all()
 
 
 @pytest.mark.thorough
-def test_a_new_views_rays_meet_the_surface_within_the_range():
-    cameras = around(25)
-    hull, new = hull_of(cameras, range(24)), cameras[24]
+def test_a_new_views_rays_meet_the_surface_within_the_range(hull: Hull):
+    new = around(25)[24]
     near, far, meets = hull_range(new, hull)
     truth = front(new)
     there = truth.isfinite()
@@ -97,9 +103,8 @@ def test_a_new_views_rays_meet_the_surface_within_the_range():
 
 
 @pytest.mark.thorough
-def test_a_view_that_misses_the_hull_keeps_its_near_and_far():
+def test_a_view_that_misses_the_hull_keeps_its_near_and_far(hull: Hull):
     cameras = around()
-    hull = hull_of(cameras, range(24))
     away = replace(cameras[0], T_world_camera=cameras[0].T_world_camera * torch.tensor([-1.0, 1.0, -1.0, 1.0]))
     near, far, meets = hull_range(away, hull)
     assert not meets.any()
@@ -118,9 +123,9 @@ def test_no_hull_without_silhouettes_or_if_they_contradict_each_other():
 
 
 @pytest.mark.thorough
-def test_the_depth_prior_lies_within_the_hull():
+def test_the_depth_prior_lies_within_the_hull(hull: Hull):
     cameras = around(25)
-    hull, new = hull_of(cameras, range(24)), cameras[24]
+    new = cameras[24]
     expected, near, far = surface_prior(new, None, cameras, hull)
     assert expected.shape == (20, 20)
     middle = front(new)[2::4, 2::4]
@@ -146,13 +151,17 @@ def write_blender_part(root: Path, part: str, cameras: Cameras, alphas: list[Ten
     (root / f"transforms_{part}.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
 
 
-def test_scenes_with_alpha_have_the_hull_of_their_training_photographs(tmp_path: Path):
-    cameras = around()
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    """Its held-out photographs are of the background alone: they would carve away everything."""
+    root, cameras = tmp_path_factory.mktemp("ball"), around()
     alphas = [alpha for alpha in pictures(cameras).alphas if alpha is not None]
-    write_blender_part(tmp_path, "train", cameras, alphas)
-    # Held-out photographs of the background alone: they would carve away everything.
-    write_blender_part(tmp_path, "test", cameras[1:4], [torch.zeros_like(alpha) for alpha in alphas[1:4]])
-    scene = load_scene(tmp_path, cache=tmp_path / "cache")
+    write_blender_part(root, "train", cameras, alphas)
+    write_blender_part(root, "test", cameras[1:4], [torch.zeros_like(alpha) for alpha in alphas[1:4]])
+    return load_scene(root, cache=root / "cache")
+
+
+def test_scenes_with_alpha_have_the_hull_of_their_training_photographs(scene: Scene):
     assert scene.points is None
     assert len(scene.test) == 3
     assert scene.hull is not None
@@ -161,13 +170,9 @@ def test_scenes_with_alpha_have_the_hull_of_their_training_photographs(tmp_path:
     assert not scene.hull.contains(middle + torch.tensor([0.0, 0.0, 1.5]))
 
 
-@pytest.mark.thorough
-def test_the_hull_is_kept_for_the_next_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    cameras = around()
-    write_blender_part(tmp_path, "train", cameras, [alpha for alpha in pictures(cameras).alphas if alpha is not None])
-    first = load_scene(tmp_path, cache=tmp_path / "cache").hull
+def test_the_hull_is_kept_for_the_next_time(scene: Scene, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("tidefield.data.load.visual_hull", Mock(side_effect=AssertionError("carved again")))
-    second = load_scene(tmp_path, cache=tmp_path / "cache").hull
+    first, second = scene.hull, load_scene(scene.root, cache=scene.root / "cache").hull
     assert first is not None
     assert second is not None
     assert torch.equal(first.filled, second.filled)

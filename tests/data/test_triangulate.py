@@ -2,6 +2,7 @@
 
 import logging
 import os
+import shutil
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +21,7 @@ from tidefield.baselines.untrained import sparse_depth
 from tidefield.data import triangulate
 from tidefield.data.load import load_scene, read_posed
 from tidefield.data.readers.posed import every_eighth
+from tidefield.data.scene import Scene
 from tidefield.geometry.lenses import Lens
 
 DOWN = np.diag([1.0, -1.0, -1.0])
@@ -40,12 +42,17 @@ def hills(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+@pytest.fixture(scope="module")
+def kept(hills: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Scene, Path]:
+    """The scene of the hills, and the cache that it was opened with."""
+    cache = tmp_path_factory.mktemp("cache")
+    return load_scene(hills, cache=cache), cache
+
+
 def test_points_of_a_scene_without_are_found_on_its_surface_and_kept(
-    hills: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    kept: tuple[Scene, Path], monkeypatch: pytest.MonkeyPatch
 ):
-    with caplog.at_level(logging.INFO):
-        scene = load_scene(hills, cache=tmp_path)
-    assert "has no sparse points: triangulating them" in caplog.text
+    scene, cache = kept
     assert scene.points is not None
     xyz = scene.points.xyz_world.double().numpy() + scene.origin_world.numpy()
     assert len(xyz) > 200
@@ -56,16 +63,20 @@ def test_points_of_a_scene_without_are_found_on_its_surface_and_kept(
     assert (scene.cameras.near_far[:, 0] > 15).all()
     assert (scene.cameras.near_far[:, 1] < 65).all()
     monkeypatch.setattr(triangulate, "triangulate", lambda *_: pytest.fail("they were kept"))
-    again = load_scene(hills, cache=tmp_path).points
+    again = load_scene(scene.root, cache=cache).points
     assert again is not None
     assert torch.equal(again.xyz_world, scene.points.xyz_world)
 
 
-def test_kept_points_that_are_damaged_are_found_again(hills: Path, tmp_path: Path):
-    first = load_scene(hills, cache=tmp_path).points
-    (store,) = tmp_path.glob("*.points")
+def test_kept_points_that_are_damaged_are_found_again(
+    kept: tuple[Scene, Path], tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
+    first, cache = kept[0].points, shutil.copytree(kept[1], tmp_path / "cache")
+    (store,) = cache.glob("*.points")
     store.write_bytes(store.read_bytes()[:100])
-    again = load_scene(hills, cache=tmp_path).points
+    with caplog.at_level(logging.INFO):
+        again = load_scene(kept[0].root, cache=cache).points
+    assert "has no sparse points: triangulating them" in caplog.text
     assert first is not None
     assert again is not None
     assert torch.equal(again.xyz_world, first.xyz_world)
@@ -85,12 +96,13 @@ def test_points_are_found_again_where_a_mask_becomes_that_of_another_photograph(
 
 @pytest.mark.skipif(os.name != "posix", reason="Windows has no such permissions")
 def test_points_of_a_cache_that_others_can_write_to_are_not_used(
-    hills: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    kept: tuple[Scene, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    load_scene(hills, cache=tmp_path)
-    tmp_path.chmod(0o777)
+    cache = shutil.copytree(kept[1], tmp_path / "cache")
     monkeypatch.setattr(triangulate, "triangulate", lambda *_: None)
-    assert load_scene(hills, cache=tmp_path).points is None
+    assert load_scene(kept[0].root, cache=cache).points is not None
+    cache.chmod(0o777)
+    assert load_scene(kept[0].root, cache=cache).points is None
 
 
 def test_a_scene_in_which_nothing_matches_says_what_to_expect(tmp_path: Path, caplog: pytest.LogCaptureFixture):
@@ -161,7 +173,7 @@ def test_points_are_placed_alike_all_at_once_and_a_few_at_a_time(tmp_path: Path,
     shuffled = np.random.default_rng(0).permutation(len(posed.points.uv_px))
     arrays = {name: getattr(posed.points, name)[shuffled] for name in ("point_index", "photograph_index", "uv_px")}
     found = []
-    for at_once in (1 << 20, 7):
+    for at_once in (1 << 20, 70):
         monkeypatch.setattr(triangulate, "_AT_ONCE", at_once)
         points = replace(posed.points, **arrays)
         found.append(triangulate.triangulate_again(points, posed.T_world_camera, posed.lenses, range(9)))
@@ -199,6 +211,6 @@ def test_nothing_of_a_held_out_photograph_reaches_a_rendering(tmp_path: Path):
         one, other = make(first), make(second)
         for i in first.test:
             assert not torch.equal(first.photographs[i], second.photographs[i])
+            views = one(first.cameras[i]), other(second.cameras[i])
             for name in ("colour", "depth", "opacity"):
-                views = one(first.cameras[i]), other(second.cameras[i])
                 assert torch.equal(*(getattr(view, name) for view in views)), f"{make.__name__}: {name}"

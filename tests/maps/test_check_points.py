@@ -37,7 +37,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     return load_scene(folder / "scene", hold_out=False, calibrate=False, cache=folder / "cache")
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def frame(scene: Scene) -> MapFrame:
     return map_frame(scene, read_georeference(scene.root))
 
