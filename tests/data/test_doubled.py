@@ -21,7 +21,7 @@ from tidefield.data.pyramid import PER_OCTAVE, Pyramid
 from tidefield.data.scene import Scene
 from tidefield.model.network import make_network
 from tidefield.model.renderer import Renderer
-from tidefield.synthetic import make_survey, write_survey
+from tidefield.synthetic import Flight, make_survey, write_survey
 from tidefield.train.loop import SceneTrainer
 from tidefield.train.pretrain import Pretrainer
 from tidefield.train.stream import Draw, Stream
@@ -148,8 +148,10 @@ def test_training_across_scenes_matches_and_reads_photographs_as_training_on_one
 
 @pytest.mark.thorough
 def test_a_view_comes_closer_to_the_photograph_that_was_not_used(tmp_path: Path):
-    write_survey(make_survey("ground_textures", seed=3, views=9, width=192), tmp_path)
-    scene = load_scene(tmp_path, width=96)
+    flight = Flight(focal_ratio=1.6)
+    survey = make_survey("ground_textures", seed=3, views=9, width=128, flight=flight, supersample=1)
+    write_survey(survey, tmp_path, truth=False)
+    scene = load_scene(tmp_path, width=64)
     torch.manual_seed(0)
     network = make_network(SWIFT.network).eval()
     truth = scene.photographs[scene.test[0]].float() / 255
