@@ -115,7 +115,7 @@ def test_training_sees_in_an_area_what_it_would_see_in_the_whole_scene(scene: Sc
     priors, config = DepthPriors(scene, match=Matcher(scene)), replace(SMALL.train, tiles=12)
     for area in (areas[0], areas[3]):
         own = DepthPriors(area.scene, match=Matcher(area.scene))
-        for target in area.targets:
+        for target in area.targets[::2]:
             name = area.scene.names[target]
             whole = priors[scene.index(name)]
             torch.testing.assert_close(own[target].cells, whole.cells)

@@ -113,7 +113,7 @@ def test_garbled_text_models_are_refused(tmp_path: Path, file: str, old: str, ne
 def test_many_points_take_little_memory(tmp_path: Path) -> None:
     folder = write_colmap(tmp_path, survey(BARREL))
     layout = [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track", "<u8")]
-    points = np.zeros(10_000, np.dtype(layout))
+    points = np.zeros(4_000, np.dtype(layout))
     (folder / "points3D.bin").write_bytes(np.uint64(len(points)).tobytes() + points.tobytes())
     tracemalloc.start()
     read_colmap(tmp_path, folder, False)
