@@ -2,7 +2,9 @@
 
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from pathlib import Path
 
 import cv2
@@ -22,22 +24,32 @@ from tidefield.survey.report import collect_findings, write_report
 from tidefield.survey.report.figures import draw_histogram
 from tidefield.survey.report.page import draw_charts
 from tidefield.survey.report.statistics import measure
+from tidefield.survey.sfm import features, matching
 from tidefield.survey.sfm.features import FeatureOptions
 
-GAINS = np.exp(np.random.default_rng(5).normal(0, 0.1, (15, 1)) * np.ones(3))
+GAINS = np.exp(np.random.default_rng(5).normal(0, 0.1, (12, 1)) * np.ones(3))
 
 
 def run(folder: Path, scene: Path, holdout: bool = True) -> Prepared:
     console = Console(quiet=True)
     return prepare(
-        read_survey(folder), scene, FeatureOptions(count=1500), pycolmap.Device.cpu, console, holdout=holdout
+        read_survey(folder), scene, FeatureOptions(count=1000), pycolmap.Device.cpu, console, holdout=holdout
     )
+
+
+@pytest.fixture(scope="module", autouse=True)
+def no_processes() -> Iterator[None]:
+    """Features and matches are found in this process."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (features, matching):
+            patch.setattr(module, "worker_processes", lambda *_: nullcontext(ThreadPoolExecutor(1)))
+        yield
 
 
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Flight:
     pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
-    return fly(tmp_path_factory.mktemp("card") / "photographs", columns=5, gains=GAINS)
+    return fly(tmp_path_factory.mktemp("card") / "photographs", gains=GAINS)
 
 
 @pytest.fixture(scope="module")
@@ -113,7 +125,7 @@ def test_held_out_photographs_are_placed_as_well_as_the_others(made: tuple[Path,
     model = pycolmap.Reconstruction(made[0] / "sparse" / "0")
     images = {image.name: image for image in map(model.image, model.reg_image_ids())}
     centres = np.array([images[name].projection_center() for name in flight.names])
-    train = [k for k in range(15) if k % 8]
+    train = [k for k in range(12) if k % 8]
     to_truth = pycolmap.estimate_sim3d(centres[train], flight.position_world[train])
     assert to_truth is not None
     error_m = np.linalg.norm(np.array([to_truth * c for c in centres]) - flight.position_world, axis=1)
@@ -146,7 +158,7 @@ def test_the_split_is_written_for_nerfstudio_and_the_report_counts_it(made: tupl
     scene, prepared = made
     written = json.loads((scene / "transforms.json").read_text(encoding="utf-8"))
     assert written["test_filenames"] == [f"images/{flight.names[k]}" for k in (0, 8)]
-    assert len(written["train_filenames"]) == 13
+    assert len(written["train_filenames"]) == 10
     page = write_report(collect_findings(prepared, scene, {"holdout": "yes"}), scene).read_text(encoding="utf-8")
     assert "2 photographs are held out" in page
     assert page.count('<td class="n">held out</td>') == 2
@@ -174,7 +186,7 @@ def test_held_out_photographs_are_no_photographs_without_features_in_the_report(
     assert {camera["photograph"] for camera in cameras if camera["points"] is None} == held_out
     statistics = measure(found)
     observed = statistics.observed[statistics.observed > 0]
-    assert len(observed) == 13
+    assert len(observed) == 10
     title = "Points per photograph"
     assert dict(draw_charts(statistics, True))[title] == draw_histogram(title, "points", "photographs", observed, 0)
 
