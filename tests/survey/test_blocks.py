@@ -1,6 +1,8 @@
 """Large surveys are reconstructed in blocks, which are merged by the photographs that they share."""
 
 import shutil
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -128,7 +130,8 @@ def test_a_lens_is_not_chosen_on_a_block_of_another_site(
     assert tried[1] is None
 
 
-def test_blocks_are_merged_to_one_model_of_the_true_shape(survey, tmp_path: Path):
+def test_blocks_are_merged_to_one_model_of_the_true_shape(survey, tmp_path: Path, monkeypatch):
+    monkeypatch.setattr(module, "worker_processes", lambda *_: nullcontext(ThreadPoolExecutor(1)))
     flight, database = survey
     photographs = flight.survey.photographs
     made = cut(photographs, matched_pairs(database, [p.name for p in photographs]), whole=10, most=20)

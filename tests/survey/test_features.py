@@ -1,5 +1,7 @@
 """Features and cameras are written to the database once, cameras with their priors."""
 
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,10 +14,16 @@ from PIL import Image
 
 from tidefield.data.sift import find_features
 from tidefield.errors import DeviceError, RunError
+from tidefield.survey.sfm import features
 from tidefield.survey.sfm.features import FeatureOptions, choose_device, extract, initial_camera, lens_groups
 from tidefield.survey.survey import LensPrior, Photograph
 
 OPTIONS, CPU = FeatureOptions(side_px=400, count=200), pycolmap.Device.cpu
+
+
+@pytest.fixture
+def without_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(features, "worker_processes", lambda *_: nullcontext(ThreadPoolExecutor(1)))
 
 
 @pytest.fixture
@@ -48,6 +56,7 @@ def test_features_are_written_largest_first_in_full_size_pixels(wall_photographs
                 assert np.asarray(db.read_descriptors(image.image_id).data).shape == (len(keypoints), 128)
 
 
+@pytest.mark.usefixtures("without_processes")
 def test_extraction_continues_where_it_was_interrupted(wall_photographs: list[Photograph], tmp_path: Path):
     calls: list[tuple[int, int]] = []
     extract(wall_photographs[:2], tmp_path / "a.db", OPTIONS, CPU, lambda done, whole: None)
@@ -115,13 +124,14 @@ def test_options_out_of_their_range_are_refused(value: int):
         FeatureOptions(side_px=value)
 
 
+@pytest.mark.usefixtures("without_processes")
 def test_a_strip_of_one_pixel_has_no_features(tmp_path: Path):
     Image.new("RGB", (20_000, 1)).save(tmp_path / "strip.png")
     strip = replace(unlocated_photograph(0, None), path=tmp_path / "strip.png", width=20_000, height=1)
     assert extract([strip], tmp_path / "a.db", OPTIONS, CPU, lambda done, whole: None) == 0
 
 
-@pytest.mark.thorough
+@pytest.mark.usefixtures("without_processes")
 @pytest.mark.parametrize("transparent", [False, True])
 def test_masked_and_transparent_pixels_have_no_features(
     wall_photographs: list[Photograph], tmp_path: Path, transparent: bool
@@ -163,6 +173,7 @@ def test_masked_pixels_leave_the_number_of_features_as_it_is(wall_photographs: l
         np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.usefixtures("without_processes")
 @pytest.mark.parametrize("height", [102, 100])
 def test_features_of_reduced_photographs_are_where_they_are_in_the_photograph(tmp_path: Path, height: int):
     rows, columns = np.mgrid[:height, :400] + 0.5
@@ -178,7 +189,7 @@ def test_features_of_reduced_photographs_are_where_they_are_in_the_photograph(tm
     assert away.max() < 0.5
 
 
-@pytest.mark.thorough
+@pytest.mark.usefixtures("without_processes")
 def test_photographs_of_twice_the_size_have_the_same_features_twice_as_far_apart(
     wall_photographs: list[Photograph], tmp_path: Path
 ):

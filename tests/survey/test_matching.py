@@ -66,7 +66,7 @@ def test_few_photographs_are_all_paired():
 
 
 def test_number_of_candidates_is_linear_with_positions():
-    small, large = lawnmower(8, 10), lawnmower(20, 100)
+    small, large = lawnmower(8, 10), lawnmower(20, 40)
     assert len(pairs_of(large)) < 1.3 * len(pairs_of(small)) * len(large) / len(small)
     assert len(pairs_of(large)) <= len(large) * (NEIGHBOURS + SEQUENTIAL)
 
@@ -211,7 +211,7 @@ def test_candidates_of_many_photographs_without_positions_take_little_memory():
 
 
 def test_the_best_pairs_of_each_photograph_are_selected_the_first_among_equals():
-    rng, count = np.random.default_rng(0), 50
+    rng, count = np.random.default_rng(0), 25
     shared = rng.integers(0, 3, (count, 3))
     ground = rng.integers(0, 255, (3, 3, 128)).astype(np.uint8)
     table = preview_descriptors([np.stack([ground[k, own[k]] for k in range(3)]) for own in shared])
@@ -224,7 +224,7 @@ def test_the_best_pairs_of_each_photograph_are_selected_the_first_among_equals()
 
 
 def test_pairs_whose_largest_features_match_are_selected_with_the_best_of_each_photograph():
-    rng, count = np.random.default_rng(0), 40
+    rng, count = np.random.default_rng(0), 34
     # Photograph k shares half of its features with k + 1.
     ground = rng.integers(0, 255, (count + 1, PREVIEW // 2, 128)).astype(np.uint8)
     table = preview_descriptors([np.concatenate([ground[k], ground[k + 1]]) for k in range(count)])
@@ -308,7 +308,8 @@ def write_database(path: Path, wrong: Mapping[int, int] | None = None) -> list[s
         return [image.name for image in images]
 
 
-def test_pairs_are_matched_verified_and_kept(tmp_path: Path):
+def test_pairs_are_matched_verified_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(matching, "worker_processes", lambda *_: nullcontext(ThreadPoolExecutor(1)))
     path = tmp_path / "database.db"
     names = write_database(path)
     pairs, calls = [(names[0], names[1]), (names[1], names[2])], []
@@ -326,8 +327,8 @@ def test_pairs_are_matched_verified_and_kept(tmp_path: Path):
         assert db.num_matches() == 0, "mapping reads no others"
 
 
-@pytest.mark.thorough
-def test_what_is_not_matched_any_more_is_deleted(tmp_path: Path):
+def test_what_is_not_matched_any_more_is_deleted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(matching, "worker_processes", lambda *_: nullcontext(ThreadPoolExecutor(1)))
     path = tmp_path / "database.db"
     first, second, third, _ = write_database(path)
     for pairs in ([(first, second), (second, third)], [(third, first), (second, first)]):
@@ -360,6 +361,7 @@ def test_matches_do_not_depend_on_the_number_of_processes(tmp_path: Path, monkey
 def test_pairs_without_matches_or_without_a_geometry_are_not_matched_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
+    monkeypatch.setattr(matching, "worker_processes", lambda *_: nullcontext(ThreadPoolExecutor(1)))
     names = write_database(tmp_path / "database.db", wrong={2: 0, 3: 30})
     shutil.copy(tmp_path / "database.db", tmp_path / "raw.db")
     pairs = list(combinations(names, 2))
@@ -375,7 +377,6 @@ def test_pairs_without_matches_or_without_a_geometry_are_not_matched_again(
         assert len(db.read_matches(first, unlike)) == 0
         assert len(db.read_matches(first, wrong)) > 0
     monkeypatch.setattr(pycolmap, "match_image_pairs", Mock(side_effect=AssertionError("matched again")))
-    monkeypatch.setattr(matching, "worker_processes", lambda *_: nullcontext(ThreadPoolExecutor(1)))
     assert match(tmp_path / "database.db", pairs, pycolmap.Device.cpu, lambda done, whole: None) == found
 
 
