@@ -11,7 +11,7 @@ import torch
 from tidefield.data.images import Photographs
 from tidefield.data.scene import Scene
 from tidefield.geometry.cameras import pixel_grid
-from tidefield.survey.colour import estimate_correction, to_common_exposure
+from tidefield.survey.colour import ExposureCorrection, estimate_correction, to_common_exposure
 
 FALLOFF = np.array([-0.9, 0.3, 0.0])
 GAINS = np.exp(np.random.default_rng(1).normal(0, 0.2, (12, 3)))
@@ -28,20 +28,32 @@ def shaded(gains: np.ndarray, falloff: np.ndarray) -> Scene:
     """The wall at moderate brightness, each photograph with its gain and all with the lens' falloff."""
     count = len(gains)
     cameras = wall.cameras(count, width=160, height=120, step=0.12)
-    pictures = []
+    scene, pictures = wall.scene(cameras), []
+    r = tangent(scene, 0)
     for k in range(count):
-        r = tangent(wall.scene(cameras), k) if k == 0 else r
         shade = np.exp(np.stack([r**2, r**4, r**6], -1) @ falloff)[..., None] * gains[k]
         light = wall.photograph(cameras[k]).numpy() * 0.55
         pictures.append(torch.from_numpy(np.clip(np.rint(light * shade), 0, 255).astype(np.uint8)))
-    scene = wall.scene(cameras)
     points = wall.points(cameras, 1500)
     return replace(scene, photographs=Photographs(tuple(pictures)), points=points, train=tuple(range(count)), test=())
 
 
-def test_gains_and_falloff_are_found():
-    scene = shaded(GAINS, FALLOFF)
-    correction = estimate_correction(scene, [0] * 12)
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return shaded(GAINS, FALLOFF)
+
+
+@pytest.fixture(scope="module")
+def correction(scene: Scene) -> ExposureCorrection:
+    return estimate_correction(scene, [0] * 12)
+
+
+@pytest.fixture(scope="module")
+def flat() -> Scene:
+    return shaded(np.ones((12, 3)), np.zeros(3))
+
+
+def test_gains_and_falloff_are_found(scene: Scene, correction: ExposureCorrection):
     assert correction.helps
     assert correction.sees_falloff
     assert correction.after < correction.gains_alone < 0.5 * correction.before
@@ -60,17 +72,14 @@ def test_gains_that_rise_along_a_flight_are_not_pulled_to_their_mean():
     np.testing.assert_allclose(relative - relative.mean(0), 0, atol=0.006)
 
 
-def test_the_memory_of_a_photograph_is_given_back_once_it_was_looked_at(monkeypatch: pytest.MonkeyPatch):
+def test_the_memory_of_a_photograph_is_given_back_once_it_was_looked_at(scene: Scene, monkeypatch: pytest.MonkeyPatch):
     released = []
     monkeypatch.setattr(Photographs, "release", lambda photographs: released.append(photographs))
-    estimate_correction(shaded(GAINS, FALLOFF), [0] * 12)
+    estimate_correction(scene, [0] * 12)
     assert len(released) == 12
 
 
-def test_corrected_photographs_agree():
-    scene = shaded(GAINS, FALLOFF)
-    correction = estimate_correction(scene, [0] * 12)
-    flat = shaded(np.ones((12, 3)), np.zeros(3))
+def test_corrected_photographs_agree(scene: Scene, flat: Scene, correction: ExposureCorrection):
     ratios = []
     for k in range(12):
         ours = to_common_exposure(
@@ -83,16 +92,15 @@ def test_corrected_photographs_agree():
     assert spread.max() < 0.02
 
 
-def test_photographs_that_agree_are_left_alone():
-    correction = estimate_correction(shaded(np.ones((12, 3)), np.zeros(3)), [0] * 12)
+def test_photographs_that_agree_are_left_alone(flat: Scene):
+    correction = estimate_correction(flat, [0] * 12)
     assert not correction.helps
     assert not correction.sees_falloff
     np.testing.assert_array_equal(correction.gain, 1)
     np.testing.assert_array_equal(correction.falloff, 0)
 
 
-def test_one_point_says_nothing_of_exposures():
-    scene = shaded(GAINS, FALLOFF)
+def test_one_point_says_nothing_of_exposures(scene: Scene):
     assert scene.points is not None
     middle = scene.points.xyz_world.norm(dim=1).argmin()
     points = scene.points.subset(torch.arange(1500) == middle)
@@ -145,8 +153,8 @@ def test_held_out_photographs_have_gain_one_and_change_nothing():
     np.testing.assert_allclose(relative - relative.mean(0), 0, atol=0.02)
 
 
-def test_without_points_nothing_is_done():
-    correction = estimate_correction(replace(shaded(GAINS, FALLOFF), points=None), [0] * 12)
+def test_without_points_nothing_is_done(scene: Scene):
+    correction = estimate_correction(replace(scene, points=None), [0] * 12)
     assert not correction.helps
     np.testing.assert_array_equal(correction.gain, 1)
 
