@@ -47,6 +47,13 @@ def _own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
 
+@pytest.fixture(autouse=True)
+def _no_gains(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing of an import depends on the exposures that loading estimates."""
+    nothing = torch.zeros(1)
+    monkeypatch.setattr("tidefield.data.load.estimate_gains", lambda _, own, *__: (torch.ones(len(own), 3), nothing))
+
+
 def write_project(root: Path, kind: str = "brown", tracks: bool = True) -> None:
     top = reconstruction(kind)
     write_opensfm(root, top)
@@ -64,8 +71,15 @@ def assert_same(own: Scene, other: Scene) -> None:
         assert torch.equal(mine, theirs)
 
 
-@pytest.mark.parametrize("text", [False, True], ids=["binary", "text"])
-@pytest.mark.parametrize("truth", [survey(BARREL), with_one_larger(survey(BARREL)), survey(PINHOLE, offset=UTM)])
+@pytest.mark.parametrize(
+    ("truth", "text"),
+    [
+        (survey(BARREL), False),
+        (with_one_larger(survey(BARREL)), True),
+        (survey(PINHOLE, offset=UTM), False),
+        (survey(PINHOLE, offset=UTM), True),
+    ],
+)
 def test_a_colmap_scene_is_imported_unchanged(tmp_path: Path, truth: Truth, text: bool) -> None:
     write_colmap(tmp_path / "theirs", truth, text)
     made, _ = import_project(tmp_path / "theirs", tmp_path / "ours")
@@ -86,7 +100,7 @@ def test_a_colmap_scene_is_imported_unchanged(tmp_path: Path, truth: Truth, text
     assert_same(load_scene(tmp_path / "ours"), load_scene(tmp_path / "theirs"))
 
 
-@pytest.mark.parametrize("kind", ["perspective", "brown", "radial"])
+@pytest.mark.parametrize("kind", ["perspective", "brown"])
 def test_an_opensfm_project_becomes_a_consistent_colmap_model(tmp_path: Path, kind: str) -> None:
     write_project(tmp_path / "project", kind)
     made, _ = import_project(tmp_path / "project", tmp_path / "scene")
