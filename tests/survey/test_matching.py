@@ -211,7 +211,7 @@ def test_candidates_of_many_photographs_without_positions_take_little_memory():
 
 
 def test_the_best_pairs_of_each_photograph_are_selected_the_first_among_equals():
-    rng, count = np.random.default_rng(0), 25
+    rng, count = np.random.default_rng(0), 40
     shared = rng.integers(0, 3, (count, 3))
     ground = rng.integers(0, 255, (3, 3, 128)).astype(np.uint8)
     table = preview_descriptors([np.stack([ground[k, own[k]] for k in range(3)]) for own in shared])
